@@ -1,0 +1,85 @@
+"""The ``fleetmap`` command: finds the verb, imports it lazily, and turns errors into one line and an exit code.
+
+Exit codes: 0 done; 1 failed while running; 2 bad input or usage; 3 a map was written, but not fit to publish.
+"""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import sys
+from collections.abc import Sequence
+
+import click
+
+from fleetmap import __version__
+from fleetmap.errors import FleetmapError
+
+# verb -> (module:command, one line for `fleetmap --help`, the extra that installs what it needs)
+VERBS: dict[str, tuple[str, str, str]] = {
+    "demo": ("demo:demo", "Simulate, map, serve, localise and judge one short street.", "all"),
+    "convert": ("convert:convert", "Turn a public data set's folder into an MCAP recording.", "recordings"),
+    "info": ("info:info", "Say what a recording holds and what it lacks.", "recordings"),
+    "map": ("map:map_", "Turn a survey drive into a map anchored in UTM.", "mapper"),
+    "serve": ("serve:serve", "Run the map server (Zenoh and HTTP).", "server"),
+    "publish": ("publish:publish", "Send a map to the server.", "server"),
+    "maps": ("maps:maps", "List the maps of a server.", "server"),
+    "localize": (
+        "localize:localize",
+        "Read a vehicle's UTM pose from its camera, frame by frame.",
+        "localizer",
+    ),
+    "evaluate": ("evaluate:evaluate", "Judge a trajectory against a reference or a map.", "all"),
+}
+
+_EPILOG = (
+    "Exit codes: 0 done; 1 failed while running; 2 bad input or usage; 3 map written, but not fit to publish."
+)
+
+
+class _LazyVerbs(click.Group):
+    """Imports a verb's module only when it is called: a vehicle does not have the server's packages."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(VERBS)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Verbs"):
+            formatter.write_dl([(verb, line) for verb, (_, line, _) in VERBS.items()])
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in VERBS:
+            return None
+        place, _, extra = VERBS[cmd_name]
+        module_name, command_name = place.split(":")
+        try:
+            module = importlib.import_module(f"fleetmap_cli.verbs.{module_name}")
+        except ModuleNotFoundError as error:
+            raise click.ClickException(
+                f"'fleetmap {cmd_name}' needs the package '{error.name}': pip install 'fleetmap[{extra}]'"
+            ) from error
+        command: click.Command = getattr(module, command_name)
+        return command
+
+
+@click.command(cls=_LazyVerbs, epilog=_EPILOG, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, prog_name="fleetmap")
+def cli() -> None:
+    """Visual maps anchored in UTM, shared by a fleet: one survey drive, everybody's pose."""
+    logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s", stream=sys.stderr)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run one verb and exit with its code."""
+    try:
+        code = cli.main(args=None if arguments is None else list(arguments), standalone_mode=False)
+    except FleetmapError as error:
+        click.echo(f"error: {error}", err=True)
+        sys.exit(error.exit_code)
+    except click.ClickException as error:
+        error.show()
+        sys.exit(2)
+    except click.Abort:
+        click.echo("interrupted", err=True)
+        sys.exit(130)
+    sys.exit(code if isinstance(code, int) else 0)

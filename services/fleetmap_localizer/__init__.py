@@ -1,0 +1,1 @@
+"""Reads a vehicle's UTM pose from its camera and the fleet's maps."""

@@ -1,0 +1,1 @@
+"""Turns a survey drive into a visual map anchored in UTM."""

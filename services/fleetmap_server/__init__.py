@@ -1,0 +1,1 @@
+"""Stores, versions and lists maps; serves them over Zenoh and HTTP."""

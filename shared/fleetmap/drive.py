@@ -1,0 +1,66 @@
+"""One vehicle's recording, whatever file it came from: time-ordered images, fixes and the way they are mounted."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.camera import Camera
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One image."""
+
+    stamp_ns: int  # UTC since the epoch, from the message header
+    image: NDArray[np.uint8]  # (height, width) grey
+
+
+@dataclass(frozen=True)
+class GnssFix:
+    """One valid position of the GNSS antenna (fixes with status -1 never become a GnssFix)."""
+
+    stamp_ns: int  # UTC since the epoch
+    lat_deg: float
+    lon_deg: float
+    height_m: float  # above the ellipsoid
+    covariance_enu_m2: Array  # (3, 3) float64, true east, north, up
+
+
+@dataclass(frozen=True)
+class Antenna:
+    """Where the GNSS antenna sits, and how we know."""
+
+    position_in_cam_m: Array  # (3,) float64
+    source: str  # "same frame", "static transform", "option", or "assumed at the camera"
+
+
+class Drive(Protocol):
+    """A recorded drive of one camera. Opening it has checked that it can be read."""
+
+    @property
+    def name(self) -> str:
+        """What to call the recording in messages and provenance: the file's name."""
+
+    @property
+    def camera(self) -> Camera:
+        """The calibrated camera of the chosen image topic. Raises CalibrationError where there is none."""
+
+    @property
+    def frame_count(self) -> int:
+        """Number of images, for progress bars."""
+
+    def frames(self) -> Iterator[Frame]:
+        """The images in time order, decoded one at a time. Raises DriveError on the first bad one."""
+
+    def gnss_fixes(self) -> list[GnssFix]:
+        """All valid fixes in time order; empty when the recording has none."""
+
+    def antenna(self) -> Antenna:
+        """Where the antenna sits in the camera's frame."""

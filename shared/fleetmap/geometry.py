@@ -1,0 +1,124 @@
+"""SE(3) and Sim(3) values, rotations as 3x3 matrices, and Umeyama's alignment.
+
+Transforms are named ``target_from_source`` and chain by matching inner names:
+``map_from_cam = map_from_body @ body_from_cam``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from fleetmap.errors import InputError
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A rigid transform ``target_from_source``: x_target = rotation @ x_source + translation_m."""
+
+    rotation: Array  # (3, 3) float64
+    translation_m: Array  # (3,) float64
+
+    @staticmethod
+    def identity() -> Pose:
+        """The transform that changes nothing."""
+        return Pose(np.eye(3), np.zeros(3))
+
+    def __matmul__(self, other: Pose) -> Pose:
+        return Pose(self.rotation @ other.rotation, self.rotation @ other.translation_m + self.translation_m)
+
+    def inverse(self) -> Pose:
+        """``source_from_target``."""
+        return Pose(self.rotation.T, -self.rotation.T @ self.translation_m)
+
+    def transform(self, points: Array) -> Array:
+        """Points (..., 3) of the source frame, in the target frame."""
+        return points @ self.rotation.T + self.translation_m
+
+
+@dataclass(frozen=True)
+class Sim3:
+    """A similarity ``target_from_source``: x_target = scale * rotation @ x_source + translation_m."""
+
+    scale: float
+    rotation: Array  # (3, 3) float64
+    translation_m: Array  # (3,) float64
+
+    def __matmul__(self, other: Sim3) -> Sim3:
+        return Sim3(
+            self.scale * other.scale,
+            self.rotation @ other.rotation,
+            self.scale * self.rotation @ other.translation_m + self.translation_m,
+        )
+
+    def inverse(self) -> Sim3:
+        """``source_from_target``."""
+        return Sim3(1.0 / self.scale, self.rotation.T, -self.rotation.T @ self.translation_m / self.scale)
+
+    def transform(self, points: Array) -> Array:
+        """Points (..., 3) of the source frame, in the target frame."""
+        return self.scale * points @ self.rotation.T + self.translation_m
+
+    def transform_pose(self, pose: Pose) -> Pose:
+        """A camera pose of the source frame, in the target frame; cameras keep their own unit scale."""
+        return Pose(self.rotation @ pose.rotation, self.transform(pose.translation_m))
+
+
+def umeyama_alignment(source: Array, target: Array, with_scale: bool = True) -> Sim3:
+    """The Sim(3) that maps ``source`` (N, 3) onto ``target`` (N, 3) with least squared error.
+
+    Source: S. Umeyama, "Least-squares estimation of transformation parameters between two point
+    patterns", PAMI 13(4), 1991, eq. 38-43.
+
+    Raises:
+        InputError: fewer than three points, or all of them on one spot.
+    """
+    if source.shape != target.shape or source.ndim != 2 or source.shape[1] != 3 or len(source) < 3:
+        raise InputError(f"alignment needs two lists of at least 3 points, got {source.shape}, {target.shape}")
+    source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
+    source_centred, target_centred = source - source_mean, target - target_mean
+    source_variance = float((source_centred**2).sum() / len(source))
+    if source_variance < 1e-18:
+        raise InputError("alignment needs points that move; all source points lie on one spot")
+    U, singular, Vt = np.linalg.svd(target_centred.T @ source_centred / len(source))  # eq. 38
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(Vt))])  # eq. 39, 43
+    rotation = U @ np.diag(signs) @ Vt  # eq. 40
+    scale = float(singular @ signs / source_variance) if with_scale else 1.0  # eq. 42
+    return Sim3(scale, rotation, target_mean - scale * rotation @ source_mean)  # eq. 41
+
+
+def so3_exp(rotation_vectors_rad: Array) -> Array:
+    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3)."""
+    return np.asarray(Rotation.from_rotvec(rotation_vectors_rad).as_matrix(), dtype=np.float64)
+
+
+def so3_log(rotations: Array) -> Array:
+    """Rotation vectors (..., 3) in rad of rotation matrices (..., 3, 3)."""
+    return np.asarray(Rotation.from_matrix(rotations).as_rotvec(), dtype=np.float64)
+
+
+def rotation_angle_rad(rotations: Array) -> Array:
+    """Rotation angle (...,) in [0, pi] of rotation matrices (..., 3, 3)."""
+    return np.asarray(np.linalg.norm(so3_log(rotations), axis=-1))
+
+
+def rotations_from_quat_xyzw(quat_xyzw: Array) -> Array:
+    """Rotation matrices (..., 3, 3) of quaternions (..., 4) in the order x, y, z, w."""
+    return np.asarray(Rotation.from_quat(quat_xyzw).as_matrix(), dtype=np.float64)
+
+
+def quat_xyzw_from_rotations(rotations: Array) -> Array:
+    """Quaternions (..., 4) in the order x, y, z, w with w >= 0, of rotation matrices (..., 3, 3)."""
+    return np.asarray(Rotation.from_matrix(rotations).as_quat(canonical=True), dtype=np.float64)
+
+
+def interpolate_pose(first: Pose, second: Pose, fraction: float) -> Pose:
+    """The pose at ``fraction`` in [0, 1] of the way: translation linear, rotation along the geodesic."""
+    turn = so3_exp(fraction * so3_log(first.rotation.T @ second.rotation))
+    translation_m = (1.0 - fraction) * first.translation_m + fraction * second.translation_m
+    return Pose(first.rotation @ turn, translation_m)

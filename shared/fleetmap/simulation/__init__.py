@@ -1,0 +1,1 @@
+"""A street built in numpy and OpenCV, with the truth known."""

@@ -1,0 +1,1 @@
+"""Where OpenCV geometry lives: features, matching, absolute pose, place recognition."""
