@@ -69,7 +69,7 @@ class Camera:
         for _ in range(_UNDISTORT_ITERATIONS):
             radial, tangential = self._distortion_terms(ideal)
             ideal = (distorted - tangential) / radial[:, None]
-        return ideal * focal + centre
+        return np.asarray(ideal * focal + centre)
 
     def is_inside(self, pixels: Array, border_px: float = 0.0) -> NDArray[np.bool_]:
         """Which pixels (N, 2) lie in the image, at least ``border_px`` from its edge; NaN is outside."""
@@ -78,13 +78,14 @@ class Camera:
         return np.asarray(inside & (y >= border_px) & (y <= self.height_px - 1 - border_px))
 
     def _pixels(self, normalised: Array) -> Array:
-        return normalised * np.array([self.fx_px, self.fy_px]) + np.array([self.cx_px, self.cy_px])
+        focal, centre = np.array([self.fx_px, self.fy_px]), np.array([self.cx_px, self.cy_px])
+        return np.asarray(normalised * focal + centre)
 
     def _distort(self, normalised: Array) -> Array:
         if not any(self.distortion):
             return normalised
         radial, tangential = self._distortion_terms(normalised)
-        return normalised * radial[:, None] + tangential
+        return np.asarray(normalised * radial[:, None] + tangential)
 
     def _distortion_terms(self, normalised: Array) -> tuple[Array, Array]:
         k1, k2, p1, p2, k3 = self.distortion

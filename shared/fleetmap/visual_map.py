@@ -71,3 +71,14 @@ class VisualMap:
     keyframes: Keyframes
     landmarks: Landmarks
     observations: Observations
+
+
+@dataclass(frozen=True)
+class LocalizationMap:
+    """What a localizer needs of one or several neighbouring 128 m cells; see fleetmap.map_package."""
+
+    anchor: UtmAnchor
+    keyframes: Keyframes
+    landmarks: Landmarks
+    seen_by_keyframe: NDArray[np.int32]  # (M,) int32 sorted; keyframe seen_by_keyframe[m] ...
+    seen_landmark: NDArray[np.int32]  # (M,) int32 ... saw landmark seen_landmark[m]
