@@ -81,7 +81,8 @@ class TrajectoryErrors:
     """Errors of N compared poses, N >= 1."""
 
     stamps_ns: Stamps  # (N,) of the estimate
-    offsets_m: Array  # (N, 3) estimate minus truth: easting, northing, height
+    true_positions_m: Array  # (N, 3) easting, northing, height where the estimate should have been
+    offsets_m: Array  # (N, 3) estimate, aligned if that was asked for, minus truth
     rotation: RotationErrors | None  # None where only positions were compared
     comparable: int  # the poses that should have been compared; coverage is the part that was
     scale: float | None = None  # of the alignment, where one was asked for
@@ -95,6 +96,11 @@ class TrajectoryErrors:
     def coverage(self) -> float:
         """Compared poses as a fraction of those that should have been."""
         return self.matched / self.comparable
+
+    @property
+    def positions_m(self) -> Array:
+        """The compared positions (N, 3), aligned if that was asked for."""
+        return self.true_positions_m + self.offsets_m
 
     @cached_property
     def distances_m(self) -> Array:
@@ -164,6 +170,7 @@ def evaluate_trajectory(
         rotations = turn @ rotations
     return TrajectoryErrors(
         stamps_ns=estimate.stamps_ns[of_estimate],
+        true_positions_m=true_positions_m,
         offsets_m=offsets_m,
         rotation=RotationErrors.of(true_rotations.transpose(0, 2, 1) @ rotations),
         comparable=len(reference),
@@ -190,9 +197,11 @@ def evaluate_against_map(query: Trajectory, survey: Trajectory, camera_offset_m:
             f"({_span(query)} against {_span(survey)}); do both belong to the same drive?"
         )
     arms_m = survey_at_query.rotations @ np.asarray(camera_offset_m, dtype=np.float64)
+    true_positions_m = survey_at_query.positions_m + arms_m
     return TrajectoryErrors(
         stamps_ns=query.stamps_ns[compared],
-        offsets_m=query.positions_m[compared] - survey_at_query.positions_m - arms_m,
+        true_positions_m=true_positions_m,
+        offsets_m=query.positions_m[compared] - true_positions_m,
         rotation=RotationErrors.of(survey_at_query.rotations.transpose(0, 2, 1) @ query.rotations[compared]),
         comparable=len(query),
     )
