@@ -1,0 +1,83 @@
+"""The door for rosbags: ROS 2 messages from and to CDR bytes, with the definitions a recording brings along."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from fleetmap.drives.mcap_file import Topic
+from fleetmap.errors import DriveError
+
+COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
+IMAGE = "sensor_msgs/msg/Image"
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+NAV_SAT_FIX = "sensor_msgs/msg/NavSatFix"
+TF_MESSAGE = "tf2_msgs/msg/TFMessage"
+
+
+class MessageDecoder:
+    """Decodes the messages of one topic by the definition that the recording itself holds."""
+
+    def __init__(self, topic: Topic) -> None:
+        self._topic = topic
+        self._typestore = _typestore_of(topic)
+
+    def decode(self, data: bytes, log_time_ns: int) -> Any:
+        """The message as an object with the fields of its definition.
+
+        Raises:
+            DriveError: the bytes do not fit the definition.
+        """
+        try:
+            return self._typestore.deserialize_cdr(data, self._topic.message_type)
+        except Exception as error:  # generated code: damaged bytes can raise anything
+            raise DriveError(
+                f"a message of {self._topic.name} (log time {log_time_ns} ns) is no"
+                f" {self._topic.message_type} in CDR: {error}"
+            ) from error
+
+
+def stamp_ns_of(header: Any) -> int:
+    """A std_msgs/Header's stamp in nanoseconds since the epoch."""
+    return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
+
+
+def frame_id_of(header: Any) -> str:
+    """A std_msgs/Header's frame, without the leading slash of older recordings."""
+    return str(header.frame_id).lstrip("/")
+
+
+@lru_cache(maxsize=1)
+def standard_typestore() -> Typestore:
+    """The definitions that ROS 2 Humble ships."""
+    return get_typestore(Stores.ROS2_HUMBLE)
+
+
+@lru_cache(maxsize=16)
+def definition_text(message_type: str) -> str:
+    """A standard type's definition with all it depends on, as MCAP's ``ros2msg`` schemas want it."""
+    return standard_typestore().generate_msgdef(message_type, ros_version=2)[0]
+
+
+def encode(message: Any) -> bytes:
+    """A message made from the standard typestore's types, as little-endian CDR."""
+    return bytes(standard_typestore().serialize_cdr(message, message.__msgtype__, little_endian=True))
+
+
+def _typestore_of(topic: Topic) -> Typestore:
+    """One store per topic: two recorders' definitions of one type may differ within one file."""
+    if not topic.schema_text.strip():
+        return standard_typestore()
+    typestore = get_typestore(Stores.EMPTY)
+    try:
+        if topic.schema_encoding == "ros2idl":
+            typestore.register(get_types_from_idl(topic.schema_text))
+        else:
+            typestore.register(get_types_from_msg(topic.schema_text, topic.message_type))
+        typestore.get_msgdef(topic.message_type)
+    except Exception as error:  # a parser fed with foreign text
+        raise DriveError(f"the message definition of {topic.name} cannot be understood: {error}") from error
+    return typestore

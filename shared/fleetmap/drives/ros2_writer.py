@@ -1,0 +1,185 @@
+"""Writes a drive as MCAP with ROS 2 CDR messages, as this project's reader and ROS 2's own tools read it."""
+
+from __future__ import annotations
+
+import os
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any, Self
+
+import numpy as np
+from mcap.writer import CompressionType, Writer
+from numpy.typing import NDArray
+
+from fleetmap import __version__
+from fleetmap.camera import Camera
+from fleetmap.drive import GnssFix
+from fleetmap.drives.image_codec import encode_image
+from fleetmap.drives.ros2_messages import (
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    NAV_SAT_FIX,
+    TF_MESSAGE,
+    definition_text,
+    encode,
+    standard_typestore,
+)
+from fleetmap.files import atomic_path, refuse_existing
+from fleetmap.geometry import Pose, quat_xyzw_from_rotations
+
+_TF_STATIC_TOPIC = "/tf_static"
+_COVARIANCE_KNOWN, _FIX, _GPS = 3, 0, 1  # constants of sensor_msgs/NavSatFix and NavSatStatus
+
+
+class DriveWriter:
+    """A context manager; the recording appears whole when the block ends without error, or not at all.
+
+    Messages may come in any order: log times are header stamps, and readers go by log time.
+    Use it as ``with DriveWriter(path, camera) as writer: writer.write_image(stamp_ns, image)``.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        camera: Camera | None,
+        *,
+        force: bool = False,
+        camera_frame_id: str = "camera",
+        image_topic: str = "/camera/image/compressed",
+        info_topic: str = "/camera/camera_info",
+        gnss_topic: str = "/gnss/fix",
+    ) -> None:
+        """Nothing is written before the block is entered; ``camera=None`` records without calibration.
+
+        Raises:
+            OutputExistsError: the file is there already and ``force`` is not given.
+        """
+        refuse_existing(path, force)
+        self._path, self._camera, self._camera_frame_id = path, camera, camera_frame_id
+        self._image_topic, self._info_topic, self._gnss_topic = image_topic, info_topic, gnss_topic
+        self._types = standard_typestore().types
+        self._transforms: list[tuple[str, str, Pose]] = []
+        self._channel_ids: dict[str, int] = {}
+        self._first_stamp_ns: int | None = None
+        self._stack = ExitStack()
+        self._file: IO[bytes]
+        self._writer: Writer
+
+    def __enter__(self) -> Self:
+        draft = self._stack.enter_context(atomic_path(self._path))
+        try:
+            self._file = self._stack.enter_context(draft.open("wb"))
+            # Images arrive compressed: a second compression would cost time and save nothing.
+            self._writer = Writer(self._file, compression=CompressionType.NONE)
+            self._writer.start(profile="ros2", library=f"fleetmap {__version__}")
+        except OSError as error:
+            self._stack.__exit__(type(error), error, error.__traceback__)
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if error is not None:  # closes the file and removes it; a full disk becomes a StorageError
+            self._stack.__exit__(kind, error, trace)
+            return
+        with self._stack:
+            self._write_transforms()
+            self._writer.finish()  # type: ignore[no-untyped-call]
+            self._file.flush()
+            os.fsync(self._file.fileno())
+
+    def write_image(self, stamp_ns: int, image: NDArray[np.uint8], *, png: bool = False) -> None:
+        """Compress a grey image (height, width) as JPEG of quality 95, or losslessly as PNG, and write it."""
+        self._write_compressed(stamp_ns, encode_image(image, png=png), "png" if png else "jpeg")
+
+    def write_jpeg(self, stamp_ns: int, jpeg: bytes) -> None:
+        """Write an image that is a JPEG already; its bytes stay as they are."""
+        self._write_compressed(stamp_ns, jpeg, "jpeg")
+
+    def write_png(self, stamp_ns: int, png: bytes) -> None:
+        """Write an image that is a PNG already; its bytes stay as they are."""
+        self._write_compressed(stamp_ns, png, "png")
+
+    def write_fix(self, fix: GnssFix, frame_id: str) -> None:
+        """Write a fix of the antenna whose frame is ``frame_id``; use the camera's own for a zero lever arm."""
+        status = self._types["sensor_msgs/msg/NavSatStatus"](status=_FIX, service=_GPS)
+        message = self._types[NAV_SAT_FIX](
+            header=self._header(fix.stamp_ns, frame_id),
+            status=status,
+            latitude=fix.lat_deg,
+            longitude=fix.lon_deg,
+            altitude=fix.height_m,
+            position_covariance=np.ascontiguousarray(fix.covariance_enu_m2, dtype=np.float64).reshape(9),
+            position_covariance_type=_COVARIANCE_KNOWN,
+        )
+        self._write(self._gnss_topic, message, fix.stamp_ns)
+
+    def write_static_transform(self, parent: str, child: str, parent_from_child: Pose) -> None:
+        """Say how two frames are mounted; all of them are written as one /tf_static message at the end."""
+        self._transforms.append((parent, child, parent_from_child))
+
+    def _write_compressed(self, stamp_ns: int, data: bytes, image_format: str) -> None:
+        if self._camera is not None:
+            self._write(self._info_topic, self._camera_info(self._camera, stamp_ns), stamp_ns)
+        message = self._types[COMPRESSED_IMAGE](
+            header=self._header(stamp_ns, self._camera_frame_id),
+            format=image_format,
+            data=np.frombuffer(data, dtype=np.uint8),
+        )
+        self._write(self._image_topic, message, stamp_ns)
+
+    def _write_transforms(self) -> None:
+        if not self._transforms:
+            return
+        stamp_ns = self._first_stamp_ns or 0
+        stamped = [
+            self._types["geometry_msgs/msg/TransformStamped"](
+                header=self._header(stamp_ns, parent), child_frame_id=child, transform=self._transform(pose)
+            )
+            for parent, child, pose in self._transforms
+        ]
+        self._write(_TF_STATIC_TOPIC, self._types[TF_MESSAGE](transforms=stamped), stamp_ns)
+
+    def _write(self, topic: str, message: Any, stamp_ns: int) -> None:
+        if topic not in self._channel_ids:
+            message_type: str = message.__msgtype__
+            schema_id = self._writer.register_schema(
+                message_type, "ros2msg", definition_text(message_type).encode()
+            )
+            self._channel_ids[topic] = self._writer.register_channel(topic, "cdr", schema_id)
+        if self._first_stamp_ns is None or stamp_ns < self._first_stamp_ns:
+            self._first_stamp_ns = stamp_ns
+        self._writer.add_message(self._channel_ids[topic], stamp_ns, encode(message), stamp_ns)
+
+    def _header(self, stamp_ns: int, frame_id: str) -> Any:
+        sec, nanosec = divmod(stamp_ns, 1_000_000_000)
+        time = self._types["builtin_interfaces/msg/Time"](sec=sec, nanosec=nanosec)
+        return self._types["std_msgs/msg/Header"](stamp=time, frame_id=frame_id)
+
+    def _camera_info(self, camera: Camera, stamp_ns: int) -> Any:
+        whole_image = self._types["sensor_msgs/msg/RegionOfInterest"](
+            x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
+        )
+        return self._types[CAMERA_INFO](
+            header=self._header(stamp_ns, self._camera_frame_id),
+            height=camera.height_px,
+            width=camera.width_px,
+            distortion_model="plumb_bob",
+            d=np.array(camera.distortion, dtype=np.float64),
+            k=camera.matrix.reshape(9),
+            r=np.eye(3).reshape(9),
+            p=np.hstack([camera.matrix, np.zeros((3, 1))]).reshape(12),
+            binning_x=0,
+            binning_y=0,
+            roi=whole_image,
+        )
+
+    def _transform(self, pose: Pose) -> Any:
+        x, y, z = (float(value) for value in pose.translation_m)
+        qx, qy, qz, qw = (float(value) for value in quat_xyzw_from_rotations(pose.rotation))
+        return self._types["geometry_msgs/msg/Transform"](
+            translation=self._types["geometry_msgs/msg/Vector3"](x=x, y=y, z=z),
+            rotation=self._types["geometry_msgs/msg/Quaternion"](x=qx, y=qy, z=qz, w=qw),
+        )
