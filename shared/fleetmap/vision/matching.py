@@ -1,0 +1,340 @@
+"""Matching of binary descriptors by Hamming distance: freely, around predictions, and along epipolar lines.
+
+The loops are compiled; descriptors of 32 bytes are looked at as four 64-bit words.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from fleetmap.vision.features import Features
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int32]
+BoolArray = NDArray[np.bool_]
+Descriptors = NDArray[np.uint8]
+
+_NO_PAIR = 1 << 20  # a Hamming distance that no pair has
+_CELL_PX = 16.0
+_EPIPOLE_RADIUS_PX = 10.0  # around the epipole every line passes close by, and the depth is unseen
+_ROTATION_BINS, _ROTATION_BIN_DEG = 30, 12.0
+
+
+def match_descriptors(
+    descriptors_a: Descriptors,
+    descriptors_b: Descriptors,
+    max_distance: int,
+    ratio: float = 0.8,
+    mutual: bool = True,
+) -> IntArray:
+    """Index pairs (P, 2) int32 of descriptors (N, 32) and (M, 32) that belong together, sorted by a.
+
+    A pair is the closest of b to its a, at most ``max_distance`` bits apart, clearly closer than the second
+    (distance <= ratio * second), and with ``mutual`` also the closest of a to its b.
+    """
+    if len(descriptors_a) == 0 or len(descriptors_b) == 0:
+        return np.zeros((0, 2), dtype=np.int32)
+    pairs: IntArray = _match_all(_words(descriptors_a), _words(descriptors_b), max_distance, ratio, mutual)
+    return pairs
+
+
+def match_by_projection(
+    predicted_px: Array,
+    radii_px: Array,
+    octave_min: NDArray[np.integer],
+    octave_max: NDArray[np.integer],
+    descriptors: Descriptors,
+    features: Features,
+    max_distance: int,
+    ratio: float,
+) -> IntArray:
+    """The feature that shows each landmark, (L,) int32, or -1 where none does.
+
+    Args:
+        predicted_px: (L, 2) undistorted pixels where the landmarks should be; NaN = not visible.
+        radii_px: (L,) how far from there to look.
+        octave_min: (L,) lowest pyramid level to accept; octave_max: (L,) the highest.
+        descriptors: (L, 32) of the landmarks.
+        features: of the image.
+        max_distance: Hamming bits.
+        ratio: the best candidate must be this much closer than the second best, where both are of
+            neighbouring octaves. Source: Mur-Artal & Tardos, "ORB-SLAM", T-RO 2015, section V.
+
+    A feature goes to at most one landmark, the closest in Hamming distance.
+    """
+    if len(predicted_px) == 0 or len(features) == 0:
+        return np.full(len(predicted_px), -1, dtype=np.int32)
+    origin, cells_across, cells_down, starts, members = _grid(features.pixels)
+    chosen: IntArray = _match_in_windows(
+        np.ascontiguousarray(predicted_px, dtype=np.float64),
+        np.ascontiguousarray(radii_px, dtype=np.float64),
+        np.ascontiguousarray(octave_min, dtype=np.int32),
+        np.ascontiguousarray(octave_max, dtype=np.int32),
+        _words(descriptors),
+        np.ascontiguousarray(features.pixels),
+        features.octaves.astype(np.int32),
+        _words(features.descriptors),
+        origin,
+        cells_across,
+        cells_down,
+        starts,
+        members,
+        max_distance,
+        ratio,
+    )
+    return chosen
+
+
+def match_epipolar(
+    features_a: Features,
+    features_b: Features,
+    use_a: BoolArray,
+    use_b: BoolArray,
+    fundamental_ba: Array,
+    epipole_in_b_px: Array,
+    max_distance: int,
+    sigma_threshold: float = 1.96,
+    rotation_check: bool = False,
+) -> IntArray:
+    """Index pairs (P, 2) int32 of features that look alike and lie on each other's epipolar line, sorted by a.
+
+    Args:
+        features_a: of the first image; use_a: (N,) which of them may be matched.
+        features_b: of the second image; use_b: (M,).
+        fundamental_ba: (3, 3) with x_b^T F x_a = 0 for undistorted pixels.
+        epipole_in_b_px: (2,) image of camera a's centre in b; features near it are left out. NaN = anywhere.
+        max_distance: Hamming bits; a pair is each other's closest among the candidates.
+        sigma_threshold: distance to the line, in sigmas of the feature in b.
+        rotation_check: keep only pairs whose patches turn alike (a camera that rolls turns all of them).
+    """
+    if len(features_a) == 0 or len(features_b) == 0:
+        return np.zeros((0, 2), dtype=np.int32)
+    pairs: IntArray = _match_along_lines(
+        np.ascontiguousarray(features_a.pixels),
+        _words(features_a.descriptors),
+        np.flatnonzero(use_a),
+        np.ascontiguousarray(features_b.pixels),
+        _words(features_b.descriptors),
+        np.flatnonzero(use_b),
+        features_b.sigmas_px,
+        np.ascontiguousarray(fundamental_ba, dtype=np.float64),
+        np.asarray(epipole_in_b_px, dtype=np.float64),
+        max_distance,
+        sigma_threshold,
+    )
+    if rotation_check:
+        turns_alike = consistent_rotation(features_a.angles_deg[pairs[:, 0]], features_b.angles_deg[pairs[:, 1]])
+        return np.asarray(pairs[turns_alike])
+    return pairs
+
+
+def consistent_rotation(angles_a_deg: NDArray[np.float32], angles_b_deg: NDArray[np.float32]) -> BoolArray:
+    """Which pairs (P,) turn by the angle that most pairs turn by, give or take 18 degrees."""
+    if len(angles_a_deg) == 0:
+        return np.zeros(0, dtype=bool)
+    turns_deg = np.mod(angles_b_deg.astype(np.float64) - angles_a_deg, 360.0)
+    bins = (turns_deg / _ROTATION_BIN_DEG).astype(np.int64) % _ROTATION_BINS
+    peak_deg = (np.argmax(np.bincount(bins, minlength=_ROTATION_BINS)) + 0.5) * _ROTATION_BIN_DEG
+    off_peak_deg = np.abs(np.mod(turns_deg - peak_deg + 180.0, 360.0) - 180.0)
+    return np.asarray(off_peak_deg <= 1.5 * _ROTATION_BIN_DEG)
+
+
+def medoid_descriptor(descriptors: Descriptors) -> int:
+    """Index of the descriptor (K, 32) with the least median Hamming distance to the others."""
+    return int(_medoid(_words(descriptors)))
+
+
+def hamming_distances(descriptors_a: Descriptors, descriptors_b: Descriptors) -> IntArray:
+    """Bits (N,) int32 in which the rows of two (N, 32) arrays differ."""
+    return np.asarray(np.bitwise_count(_words(descriptors_a) ^ _words(descriptors_b)).sum(axis=1), dtype=np.int32)
+
+
+def _words(descriptors: Descriptors) -> NDArray[np.uint64]:
+    return np.ascontiguousarray(descriptors, dtype=np.uint8).view(np.uint64)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _hamming(a, i, b, j):  # type: ignore[no-untyped-def]
+    """Bits that differ; the counting trick is recognised by LLVM and becomes one popcount per word."""
+    total = np.uint64(0)
+    for word in range(4):
+        x = a[i, word] ^ b[j, word]
+        x = x - ((x >> np.uint64(1)) & np.uint64(0x5555555555555555))
+        x = (x & np.uint64(0x3333333333333333)) + ((x >> np.uint64(2)) & np.uint64(0x3333333333333333))
+        x = (x + (x >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
+        total += (x * np.uint64(0x0101010101010101)) >> np.uint64(56)
+    return np.int64(total)
+
+
+@njit(cache=True, nogil=True)
+def _match_all(words_a, words_b, max_distance, ratio, mutual):  # type: ignore[no-untyped-def]
+    count_a, count_b = len(words_a), len(words_b)
+    best_of_b = np.full(count_b, _NO_PAIR, np.int64)
+    a_of_b = np.full(count_b, -1, np.int32)
+    b_of_a = np.full(count_a, -1, np.int32)
+    for i in range(count_a):
+        best, second, chosen = _NO_PAIR, _NO_PAIR, -1
+        for j in range(count_b):
+            distance = _hamming(words_a, i, words_b, j)
+            if distance < best:
+                second, best, chosen = best, distance, j
+            elif distance < second:
+                second = distance
+            if distance < best_of_b[j]:
+                best_of_b[j] = distance
+                a_of_b[j] = i
+        if best <= max_distance and best <= ratio * second:
+            b_of_a[i] = chosen
+    return _pairs(b_of_a, a_of_b, mutual)
+
+
+@njit(cache=True, nogil=True)
+def _pairs(b_of_a, a_of_b, mutual):  # type: ignore[no-untyped-def]
+    pairs = np.empty((len(b_of_a), 2), np.int32)
+    found = 0
+    for i in range(len(b_of_a)):
+        j = b_of_a[i]
+        if j >= 0 and (not mutual or a_of_b[j] == i):
+            pairs[found, 0], pairs[found, 1] = i, j
+            found += 1
+    return pairs[:found].copy()
+
+
+@njit(cache=True, nogil=True)
+def _grid(pixels):  # type: ignore[no-untyped-def]
+    """Features sorted into square cells: cell c holds members[starts[c]:starts[c + 1]]."""
+    origin = np.array([pixels[:, 0].min(), pixels[:, 1].min()])
+    across = int((pixels[:, 0].max() - origin[0]) / _CELL_PX) + 1
+    down = int((pixels[:, 1].max() - origin[1]) / _CELL_PX) + 1
+    cells = np.empty(len(pixels), np.int64)
+    starts = np.zeros(across * down + 1, np.int64)
+    for i in range(len(pixels)):
+        column = int((pixels[i, 0] - origin[0]) / _CELL_PX)
+        row = int((pixels[i, 1] - origin[1]) / _CELL_PX)
+        cells[i] = row * across + column
+        starts[cells[i] + 1] += 1
+    for c in range(across * down):
+        starts[c + 1] += starts[c]
+    filled = starts[:-1].copy()
+    members = np.empty(len(pixels), np.int64)
+    for i in range(len(pixels)):
+        members[filled[cells[i]]] = i
+        filled[cells[i]] += 1
+    return origin, across, down, starts, members
+
+
+@njit(cache=True, nogil=True)
+def _match_in_windows(  # type: ignore[no-untyped-def]
+    predicted_px,
+    radii_px,
+    octave_min,
+    octave_max,
+    words,
+    feature_px,
+    feature_octaves,
+    feature_words,
+    origin,
+    cells_across,
+    cells_down,
+    starts,
+    members,
+    max_distance,
+    ratio,
+):
+    chosen = np.full(len(predicted_px), -1, np.int32)
+    taken_at = np.full(len(feature_px), _NO_PAIR, np.int64)
+    taken_by = np.full(len(feature_px), -1, np.int64)
+    for landmark in range(len(predicted_px)):
+        u, v, radius = predicted_px[landmark, 0], predicted_px[landmark, 1], radii_px[landmark]
+        if not (np.isfinite(u) and np.isfinite(v) and radius > 0.0):
+            continue
+        left = max(0.0, np.floor((u - radius - origin[0]) / _CELL_PX))
+        right = min(cells_across - 1.0, np.floor((u + radius - origin[0]) / _CELL_PX))
+        top = max(0.0, np.floor((v - radius - origin[1]) / _CELL_PX))
+        bottom = min(cells_down - 1.0, np.floor((v + radius - origin[1]) / _CELL_PX))
+        if right < left or bottom < top:
+            continue
+        best, second, best_feature, best_octave, second_octave = _NO_PAIR, _NO_PAIR, -1, -1, -10
+        for row in range(int(top), int(bottom) + 1):
+            for slot in range(starts[row * cells_across + int(left)], starts[row * cells_across + int(right) + 1]):
+                feature = members[slot]
+                octave = feature_octaves[feature]
+                if octave < octave_min[landmark] or octave > octave_max[landmark]:
+                    continue
+                du, dv = feature_px[feature, 0] - u, feature_px[feature, 1] - v
+                if du * du + dv * dv > radius * radius:
+                    continue
+                distance = _hamming(words, landmark, feature_words, feature)
+                if distance < best:
+                    second, second_octave = best, best_octave
+                    best, best_octave, best_feature = distance, octave, feature
+                elif distance < second:
+                    second, second_octave = distance, octave
+        if best > max_distance or (abs(best_octave - second_octave) <= 1 and best > ratio * second):
+            continue
+        if best < taken_at[best_feature]:
+            if taken_by[best_feature] >= 0:
+                chosen[taken_by[best_feature]] = -1
+            taken_at[best_feature], taken_by[best_feature] = best, landmark
+            chosen[landmark] = best_feature
+    return chosen
+
+
+@njit(cache=True, nogil=True)
+def _match_along_lines(  # type: ignore[no-untyped-def]
+    pixels_a, words_a, chosen_a, pixels_b, words_b, chosen_b, sigmas_b, F, epipole, max_distance, sigma_threshold
+):
+    """The features of b are packed first, so that the scan along each line reads memory in order."""
+    packed_b = np.empty(len(chosen_b), np.int64)
+    x_b, y_b, reach_b = np.empty(len(chosen_b)), np.empty(len(chosen_b)), np.empty(len(chosen_b))
+    count_b = 0
+    for j in chosen_b:
+        if np.isfinite(epipole[0]) and np.isfinite(epipole[1]):
+            du, dv = pixels_b[j, 0] - epipole[0], pixels_b[j, 1] - epipole[1]
+            if np.sqrt(du * du + dv * dv) < _EPIPOLE_RADIUS_PX * sigmas_b[j]:
+                continue
+        packed_b[count_b], x_b[count_b], y_b[count_b] = j, pixels_b[j, 0], pixels_b[j, 1]
+        reach_b[count_b] = sigma_threshold * sigmas_b[j]
+        count_b += 1
+    best_of_b = np.full(len(pixels_b), max_distance + 1, np.int64)
+    a_of_b = np.full(len(pixels_b), -1, np.int32)
+    b_of_a = np.full(len(pixels_a), -1, np.int32)
+    for i in chosen_a:
+        u, v = pixels_a[i, 0], pixels_a[i, 1]
+        line_x = F[0, 0] * u + F[0, 1] * v + F[0, 2]
+        line_y = F[1, 0] * u + F[1, 1] * v + F[1, 2]
+        line_w = F[2, 0] * u + F[2, 1] * v + F[2, 2]
+        length = np.sqrt(line_x * line_x + line_y * line_y)
+        if not length > 0.0:
+            continue
+        line_x, line_y, line_w = line_x / length, line_y / length, line_w / length
+        best = max_distance + 1
+        for k in range(count_b):
+            if abs(line_x * x_b[k] + line_y * y_b[k] + line_w) > reach_b[k]:
+                continue
+            j = packed_b[k]
+            distance = _hamming(words_a, i, words_b, j)
+            if distance < best:
+                best = distance
+                b_of_a[i] = j
+            if distance < best_of_b[j]:
+                best_of_b[j] = distance
+                a_of_b[j] = i
+    return _pairs(b_of_a, a_of_b, True)
+
+
+@njit(cache=True, nogil=True)
+def _medoid(words):  # type: ignore[no-untyped-def]
+    count = len(words)
+    distances = np.zeros((count, count), np.int64)
+    for i in range(count):
+        for j in range(i):
+            distances[i, j] = distances[j, i] = _hamming(words, i, words, j)
+    best, chosen = 1 << 20, 0
+    for i in range(count):
+        median = np.sort(distances[i])[count // 2]
+        if median < best:
+            best, chosen = median, i
+    return chosen

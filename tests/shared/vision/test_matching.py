@@ -1,0 +1,220 @@
+"""Matching: true pairs are found, false ones refused, and no feature is given away twice."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fleetmap.vision.features import Features
+from fleetmap.vision.matching import (
+    consistent_rotation,
+    hamming_distances,
+    match_by_projection,
+    match_descriptors,
+    match_epipolar,
+    medoid_descriptor,
+)
+
+K = np.array([[500.0, 0.0, 320.0], [0.0, 500.0, 200.0], [0.0, 0.0, 1.0]])
+
+
+def random_descriptors(count: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, (count, 32), dtype=np.uint8)
+
+
+def flip_bits(descriptors: np.ndarray, bits: int, seed: int = 1) -> np.ndarray:
+    """Every row with exactly so many of its bits turned over."""
+    rng = np.random.default_rng(seed)
+    unpacked = np.unpackbits(descriptors, axis=1)
+    for row in unpacked:
+        row[rng.choice(256, bits, replace=False)] ^= 1
+    return np.packbits(unpacked, axis=1)
+
+
+def features_at(pixels: np.ndarray, descriptors: np.ndarray, octaves: np.ndarray | None = None) -> Features:
+    return Features(
+        pixels=np.asarray(pixels, dtype=np.float64),
+        octaves=np.zeros(len(pixels), np.uint8) if octaves is None else octaves.astype(np.uint8),
+        angles_deg=np.zeros(len(pixels), np.float32),
+        descriptors=descriptors,
+        scale_factor=1.2,
+    )
+
+
+def test_hamming_distance_counts_the_bits_that_differ() -> None:
+    descriptors = random_descriptors(50)
+    assert np.all(hamming_distances(descriptors, descriptors) == 0)
+    assert np.all(hamming_distances(descriptors, flip_bits(descriptors, 37)) == 37)
+    assert np.all(hamming_distances(descriptors, ~descriptors) == 256)
+
+
+def test_shuffled_and_disturbed_descriptors_find_their_partners() -> None:
+    a = random_descriptors(300)
+    order = np.random.default_rng(2).permutation(300)
+    pairs = match_descriptors(a, flip_bits(a, 30)[order], max_distance=64)
+    assert pairs.dtype == np.int32
+    assert np.array_equal(pairs[:, 0], np.arange(300))
+    assert np.array_equal(order[pairs[:, 1]], pairs[:, 0])
+
+
+def test_descriptors_that_differ_by_more_than_allowed_are_not_paired() -> None:
+    a = random_descriptors(100)
+    b = flip_bits(a, 40)
+    assert len(match_descriptors(a, b, max_distance=40)) == 100
+    assert len(match_descriptors(a, b, max_distance=39)) == 0
+
+
+def test_an_ambiguous_descriptor_is_refused_by_the_ratio() -> None:
+    a = random_descriptors(1)
+    b = np.concatenate([flip_bits(a, 20, seed=3), flip_bits(a, 22, seed=4)])
+    assert len(match_descriptors(a, b, 64, ratio=0.8)) == 0
+    assert match_descriptors(a, b, 64, ratio=1.0).tolist() == [[0, 0]]
+
+
+def test_mutual_matching_gives_each_partner_once() -> None:
+    b = random_descriptors(1)
+    a = np.concatenate([flip_bits(b, 20), flip_bits(b, 5)])
+    assert match_descriptors(a, b, 64, mutual=True).tolist() == [[1, 0]]
+    assert match_descriptors(a, b, 64, mutual=False).tolist() == [[0, 0], [1, 0]]
+
+
+def test_nothing_matches_nothing() -> None:
+    none, some = random_descriptors(0), random_descriptors(4)
+    assert match_descriptors(none, some, 64).shape == (0, 2)
+    assert match_descriptors(some, none, 64).shape == (0, 2)
+    empty = features_at(np.zeros((0, 2)), none)
+    full = features_at(np.ones((4, 2)), some)
+    flags = np.ones(4, bool)
+    assert match_epipolar(empty, full, flags[:0], flags, np.eye(3), np.full(2, np.nan), 64).shape == (0, 2)
+    found = match_by_projection(
+        np.ones((4, 2)), np.ones(4), np.zeros(4, int), np.full(4, 7), some, empty, max_distance=64, ratio=0.8
+    )
+    assert found.tolist() == [-1] * 4
+
+
+def test_projection_finds_each_landmark_near_its_prediction() -> None:
+    rng = np.random.default_rng(5)
+    pixels = rng.uniform((0, 0), (640, 400), (500, 2))
+    descriptors = random_descriptors(500)
+    octaves = rng.integers(0, 8, 500)
+    features = features_at(pixels, flip_bits(descriptors, 25), octaves)
+    predicted = pixels + rng.uniform(-5, 5, pixels.shape)
+    predicted[:20] = np.nan
+    predicted[20:40] += 40.0
+    found = match_by_projection(
+        predicted, np.full(500, 8.0), octaves - 1, octaves + 1, descriptors, features, max_distance=50, ratio=0.8
+    )
+    assert np.array_equal(found[40:], np.arange(40, 500))
+    assert np.all(found[:40] == -1)
+
+
+def test_projection_refuses_other_octaves() -> None:
+    descriptors = random_descriptors(1)
+    features = features_at(np.array([[10.0, 10.0]]), descriptors, np.array([5]))
+    here = np.array([[10.0, 10.0]])
+    common = {"descriptors": descriptors, "features": features, "max_distance": 50, "ratio": 0.8}
+    radius = np.array([5.0])
+    assert match_by_projection(here, radius, np.array([2]), np.array([4]), **common).tolist() == [-1]
+    assert match_by_projection(here, radius, np.array([4]), np.array([6]), **common).tolist() == [0]
+
+
+def test_projection_gives_a_feature_to_the_closest_landmark_only() -> None:
+    feature = random_descriptors(1)
+    landmarks = np.concatenate([flip_bits(feature, 20), flip_bits(feature, 10), flip_bits(feature, 30)])
+    found = match_by_projection(
+        np.full((3, 2), 50.0),
+        np.full(3, 5.0),
+        np.zeros(3, int),
+        np.full(3, 7),
+        landmarks,
+        features_at(np.array([[51.0, 50.0]]), feature),
+        max_distance=50,
+        ratio=0.8,
+    )
+    assert found.tolist() == [-1, 0, -1]
+
+
+def test_projection_applies_the_ratio_between_neighbouring_octaves_only() -> None:
+    landmark = random_descriptors(1)
+    candidates = np.concatenate([flip_bits(landmark, 20, seed=3), flip_bits(landmark, 22, seed=4)])
+    pixels = np.array([[10.0, 10.0], [12.0, 10.0]])
+    window = (np.array([[11.0, 10.0]]), np.array([5.0]), np.array([0]), np.array([7]), landmark)
+    neighbours = features_at(pixels, candidates, np.array([2, 3]))
+    apart = features_at(pixels, candidates, np.array([2, 5]))
+    assert match_by_projection(*window, neighbours, max_distance=50, ratio=0.8).tolist() == [-1]
+    assert match_by_projection(*window, apart, max_distance=50, ratio=0.8).tolist() == [0]
+
+
+def two_views(count: int = 400) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Pixels of common points in two cameras, F with x_b^T F x_a = 0, and a's centre seen in b."""
+    rng = np.random.default_rng(7)
+    points = rng.uniform((-6, -3, 6), (6, 3, 25), (count, 3))
+    angle = 0.05
+    rotation = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    t = np.array([0.2, 0.05, -1.5])
+    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
+    fundamental = np.linalg.inv(K).T @ cross @ rotation @ np.linalg.inv(K)
+    in_b = points @ rotation.T + t
+    pixels_a, pixels_b = (points @ K.T)[:, :2] / points[:, 2:], (in_b @ K.T)[:, :2] / in_b[:, 2:]
+    epipole = (K @ t)[:2] / t[2]
+    return pixels_a, pixels_b, fundamental, epipole
+
+
+def test_epipolar_matching_finds_true_pairs_among_look_alikes() -> None:
+    pixels_a, pixels_b, fundamental, epipole = two_views()
+    descriptors = random_descriptors(400)
+    descriptors[200:] = flip_bits(descriptors[:200], 12)  # everything has a look-alike elsewhere in the image
+    noise = np.random.default_rng(1).normal(0.0, 0.3, pixels_b.shape)
+    a, b = features_at(pixels_a, descriptors), features_at(pixels_b + noise, flip_bits(descriptors, 10, seed=9))
+    pairs = match_epipolar(a, b, np.ones(400, bool), np.ones(400, bool), fundamental, epipole, 60)
+    true = pairs[:, 0] == pairs[:, 1]
+    far_from_epipole = np.linalg.norm(b.pixels - epipole, axis=1) > 10.0
+    assert len(pairs) > 0.97 * far_from_epipole.sum()
+    assert true.mean() > 0.97
+    assert len(np.unique(pairs[:, 1])) == len(pairs)
+
+
+def test_epipolar_matching_respects_the_line_the_epipole_and_the_flags() -> None:
+    pixels_a, pixels_b, fundamental, epipole = two_views()
+    descriptors = random_descriptors(400)
+    a = features_at(pixels_a, descriptors)
+    every = np.ones(400, bool)
+    anywhere = np.full(2, np.nan)
+
+    lines = np.c_[pixels_a, np.ones(400)] @ fundamental.T
+    normals = lines[:, :2] / np.linalg.norm(lines[:, :2], axis=1, keepdims=True)
+    for off_px, expected in ((1.9, 400), (2.1, 0)):
+        b = features_at(pixels_b + off_px * normals, descriptors)
+        assert len(match_epipolar(a, b, every, every, fundamental, anywhere, 0)) == expected
+    coarse = features_at(pixels_b + 2.1 * normals, descriptors, np.full(400, 1))
+    assert len(match_epipolar(a, coarse, every, every, fundamental, anywhere, 0)) == 400
+
+    b = features_at(pixels_b, descriptors)
+    near = np.linalg.norm(pixels_b - epipole, axis=1) < 10.0
+    assert 0 < near.sum() < 20
+    pairs = match_epipolar(a, b, every, every, fundamental, epipole, 0)
+    assert not np.any(near[pairs[:, 1]])
+    assert len(pairs) == 400 - near.sum()
+
+    use_a, use_b = np.arange(400) % 2 == 0, np.arange(400) % 3 == 0
+    pairs = match_epipolar(a, b, use_a, use_b, fundamental, anywhere, 0)
+    assert np.array_equal(pairs[:, 0], np.flatnonzero(use_a & use_b))
+
+
+def test_pairs_that_turn_against_the_rest_are_told_apart() -> None:
+    rng = np.random.default_rng(0)
+    angles_a = rng.uniform(0, 360, 200).astype(np.float32)
+    turns = np.full(200, 358.0)
+    turns += rng.uniform(-5, 5, 200)
+    turns[:50] = rng.uniform(60, 300, 50)
+    angles_b = np.mod(angles_a + turns, 360.0).astype(np.float32)
+    kept = consistent_rotation(angles_a, angles_b)
+    assert np.all(kept[50:])
+    assert not np.any(kept[:50])
+
+
+def test_the_medoid_is_the_descriptor_in_the_middle() -> None:
+    middle = random_descriptors(1)
+    around = np.concatenate([flip_bits(middle, 30, seed=seed) for seed in range(6)])
+    track = np.concatenate([around[:3], middle, around[3:]])
+    assert medoid_descriptor(track) == 3
+    assert medoid_descriptor(middle) == 0
