@@ -53,8 +53,6 @@ def _fixes_in_utm(fixes: Sequence[GnssFix], epsg: int) -> tuple[NDArray[np.int64
     """Stamps (N,), strictly increasing, and UTM positions (N, 3) of the fixes; of equal stamps the first."""
     stamps_ns, first = np.unique(np.array([fix.stamp_ns for fix in fixes], dtype=np.int64), return_index=True)
     if len(stamps_ns) < 2:
-        raise TrajectoryError(
-            f"a spline needs GNSS fixes at two times or more, the recording has {len(stamps_ns)}"
-        )
+        raise TrajectoryError(f"a spline needs two GNSS fixes or more, the recording holds {len(stamps_ns)}")
     lat_deg, lon_deg, height_m = np.array([(fix.lat_deg, fix.lon_deg, fix.height_m) for fix in fixes])[first].T
     return stamps_ns, UtmGrid(epsg).from_geodetic(lat_deg, lon_deg, height_m)

@@ -159,16 +159,15 @@ def _require_drawable(plot: Path) -> None:
 def _draw(plot: Path, inputs: _Inputs, errors: dict[str, TrajectoryErrors]) -> None:
     from fleetmap_cli.plotting import Track, plot_evaluation
 
-    tracks = []
-    if inputs.reference is not None:
-        tracks.append(Track("reference", inputs.reference.positions_m, "k--"))
+    aligned = "reference" in errors and errors["reference"].scale is not None
+    estimate_m = errors["reference"].positions_m if aligned else inputs.estimate.positions_m
+    tracks = [Track("estimate, aligned" if aligned else "estimate", estimate_m, "C0.-")]
     if inputs.survey is not None:
         tracks.append(Track("trajectory of the map", inputs.survey.positions_m, "C2-"))
     if "spline" in errors:
         tracks.append(Track("GNSS spline", errors["spline"].positions_m, "C1-"))
-    aligned = "reference" in errors and errors["reference"].scale is not None
-    estimate_m = errors["reference"].positions_m if aligned else inputs.estimate.positions_m
-    tracks.append(Track("estimate, aligned" if aligned else "estimate", estimate_m, "C0.-"))
+    if inputs.reference is not None:
+        tracks.append(Track("reference", inputs.reference.positions_m, "k--"))
     plot_evaluation(plot, tracks, {_TITLES[name]: entry for name, entry in errors.items()})
 
 

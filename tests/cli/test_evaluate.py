@@ -1,0 +1,137 @@
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fleetmap.geometry import so3_exp
+from fleetmap.trajectory import Trajectory, write_trajectory
+from fleetmap_cli.main import main
+
+START_NS = 1_700_000_000_000_000_000
+OFFSET_IN_CAM_M = (-0.54, 0.02, 0.1)
+
+
+def straight_drive(epsg: int = 32632) -> Trajectory:
+    count = 50
+    stamps_ns = START_NS + np.arange(count, dtype=np.int64) * 100_000_000
+    positions_m = np.array([455_300.0, 5_425_500.0, 120.0]) + np.arange(count)[:, None] * [0.3, 0.8, 0.0]
+    forward = so3_exp(np.array([0.0, 0.0, -0.36])) @ so3_exp(np.array([-np.pi / 2.0, 0.0, 0.0]))
+    return Trajectory(epsg, stamps_ns, positions_m, np.tile(forward, (count, 1, 1)))
+
+
+def shifted(drive: Trajectory, shift_m: np.ndarray) -> Trajectory:
+    return Trajectory(drive.epsg, drive.stamps_ns, drive.positions_m + shift_m, drive.rotations)
+
+
+@pytest.fixture
+def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """reference.tum, estimate.tum 0.5 m beside and 1.2 m above it, second.tum seen by a second camera."""
+    monkeypatch.chdir(tmp_path)
+    truth = straight_drive()
+    write_trajectory(tmp_path / "reference.tum", truth)
+    write_trajectory(tmp_path / "estimate.tum", shifted(truth, np.array([0.3, -0.4, 1.2])))
+    write_trajectory(tmp_path / "second.tum", shifted(truth, truth.rotations[0] @ np.array(OFFSET_IN_CAM_M)))
+    write_trajectory(tmp_path / "other_zone.tum", straight_drive(32633))
+    return tmp_path
+
+
+def run(*arguments: str) -> int:
+    with pytest.raises(SystemExit) as exit_:
+        main(["evaluate", *arguments])
+    assert isinstance(exit_.value.code, int)
+    return exit_.value.code
+
+
+@pytest.mark.usefixtures("files")
+def test_the_table_shows_the_printed_rows_in_3d_and_horizontally(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("estimate.tum", "reference.tum") == 0
+    out, err = capsys.readouterr()
+    rows = {line.split()[0]: line.split()[1:] for line in out.splitlines()[2:10]}
+    assert list(rows) == ["max", "mean", "median", "min", "rmse", "sse", "std", "p95"]
+    assert rows["rmse"] == ["1.3000", "0.5000"]
+    assert rows["sse"] == ["84.5000", "12.5000"]
+    assert rows["std"] == ["0.0000", "0.0000"]
+    assert "50 of 50 poses compared (100.0 %)" in out
+    assert "rotation error (deg): median 0.000" in out
+    assert err == ""
+
+
+@pytest.mark.usefixtures("files")
+def test_json_is_one_object_with_the_documented_keys_and_nothing_else(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert run("second.tum", "reference.tum", "--against-map", "reference.tum", "--json") == 0
+    figures = json.loads(capsys.readouterr().out)
+    assert set(figures) == {"reference", "against_map"}
+    for entry in figures.values():
+        assert entry["position_m"]["median"] == pytest.approx(np.linalg.norm(OFFSET_IN_CAM_M), abs=1e-5)
+        assert entry["matched"] == 50
+        assert entry["coverage"] == 1.0
+        assert entry["over_2m"] == 0
+
+
+@pytest.mark.usefixtures("files")
+@pytest.mark.parametrize("joined", [True, False])
+def test_a_camera_offset_may_begin_with_a_minus(joined: bool, capsys: pytest.CaptureFixture[str]) -> None:
+    text = ",".join(str(number) for number in OFFSET_IN_CAM_M)
+    offset = [f"--camera-offset={text}"] if joined else ["--camera-offset", text]
+    assert run("second.tum", "--against-map", "reference.tum", *offset, "--json") == 0
+    assert json.loads(capsys.readouterr().out)["against_map"]["position_m"]["max"] < 1e-5
+
+
+@pytest.mark.usefixtures("files")
+def test_sim3_alignment_takes_a_shift_away_and_reports_the_scale(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("estimate.tum", "reference.tum", "--align", "sim3", "--json") == 0
+    figures = json.loads(capsys.readouterr().out)["reference"]
+    assert figures["position_m"]["max"] < 1e-5
+    assert figures["scale"] == pytest.approx(1.0, abs=1e-6)
+
+
+def test_the_plot_is_a_picture_and_replaces_an_older_one(files: Path) -> None:
+    (files / "out.png").write_text("an older picture")
+    assert run("estimate.tum", "reference.tum", "--against-map", "second.tum", "--plot", "out.png") == 0
+    data = (files / "out.png").read_bytes()
+    assert data.startswith(b"\x89PNG\r\n\x1a\n")
+    width, height = struct.unpack(">II", data[16:24])
+    assert (width, height) == (1560, 720)
+    assert not list(files.glob(".*"))
+
+
+def test_a_failed_judgement_leaves_no_picture(files: Path) -> None:
+    assert run("estimate.tum", "other_zone.tum", "--plot", "out.png") == 2
+    assert not (files / "out.png").exists()
+
+
+@pytest.mark.usefixtures("files")
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (["estimate.tum"], "nothing to judge against"),
+        (["estimate.tum", "absent.tum"], "absent.tum"),
+        (["estimate.tum", "other_zone.tum"], "EPSG:32632"),
+        (["estimate.tum", "reference.tum", "--plot", "out.docx"], ".png"),
+        (["estimate.tum", "reference.tum", "--camera-offset", "1,2,3"], "--against-map"),
+        (["estimate.tum", "--against-map", "reference.tum", "--camera-offset", "1,2"], "X,Y,Z"),
+        (["estimate.tum", "--against-map", "reference.tum", "--align", "sim3"], "REFERENCE.tum"),
+        (["estimate.tum", "--against-map", "reference.tum", "--spline-through", "a.mcap"], "REFERENCE.tum"),
+        (["estimate.tum", "reference.tum", "--spline-through", "absent.mcap"], "absent.mcap"),
+    ],
+)
+def test_bad_usage_and_bad_input_end_with_exit_code_2(
+    arguments: list[str], complaint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(*arguments) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert complaint in err
+    assert "Traceback" not in err
+
+
+def test_an_estimate_without_any_pose_is_told_apart(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (files / "empty.tum").write_text("# epsg=32632\n")
+    assert run("empty.tum", "reference.tum") == 2
+    assert "no pose at all" in capsys.readouterr().err
