@@ -9,11 +9,24 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
+import numpy as np
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    StringConstraints,
+    ValidationError,
+    model_validator,
+)
 
+from fleetmap.camera import Camera
 from fleetmap.errors import MapPackageError
+from fleetmap.geodesy import UtmAnchor
+from fleetmap.geometry import Sim3, quat_xyzw_from_rotations, rotations_from_quat_xyzw
 
 FORMAT_NAME = "fleetmap-map"
 FORMAT_MAJOR, FORMAT_MINOR = 1, 0
@@ -23,8 +36,28 @@ MAX_PART_BYTES = 512 * 1024 * 1024
 MAX_PARTS = 100_000
 MAP_ID_PATTERN = r"^[a-z0-9][a-z0-9_-]{0,63}$"
 
+MAX_INDEX = 2**31 - 1  # keyframes and landmarks are counted in int32
+
 Sha256 = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
+PartKind = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]{0,31}$")]
 MapId = Annotated[str, StringConstraints(pattern=MAP_ID_PATTERN)]
+Int64 = Annotated[int, Field(ge=-(2**63), le=2**63 - 1)]
+Metres = Annotated[int, Field(ge=-100_000_000, le=100_000_000)]
+CellNumber = Annotated[int, Field(ge=-1_000_000, le=1_000_000)]
+LonDeg = Annotated[float, Field(ge=-180.0, le=180.0)]
+LatDeg = Annotated[float, Field(ge=-90.0, le=90.0)]
+
+
+def _utm_zone(epsg: int) -> int:
+    if not (32601 <= epsg <= 32660 or 32701 <= epsg <= 32760):
+        raise ValueError("no UTM zone on WGS84 (326xx north, 327xx south)")
+    return epsg
+
+
+def _unit_quaternion(quat_xyzw: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
+    if abs(sum(q * q for q in quat_xyzw) - 1.0) > 1e-6:
+        raise ValueError("no unit quaternion")
+    return quat_xyzw
 
 
 class _Model(BaseModel):
@@ -42,18 +75,43 @@ class Format(_Model):
 class AnchorRecord(_Model):
     """The map frame's origin; see fleetmap.geodesy.UtmAnchor."""
 
-    epsg: int
-    easting_m: int
-    northing_m: int
-    height_m: int
+    epsg: Annotated[int, AfterValidator(_utm_zone)]
+    easting_m: Metres
+    northing_m: Metres
+    height_m: Metres
+
+    @staticmethod
+    def of(anchor: UtmAnchor) -> AnchorRecord:
+        """The record of an anchor."""
+        return AnchorRecord(
+            epsg=anchor.epsg,
+            easting_m=anchor.easting_m,
+            northing_m=anchor.northing_m,
+            height_m=anchor.height_m,
+        )
+
+    def to_anchor(self) -> UtmAnchor:
+        """The anchor of the record."""
+        return UtmAnchor(self.epsg, self.easting_m, self.northing_m, self.height_m)
 
 
 class Sim3Record(_Model):
     """A similarity transform; rotation as quaternion x, y, z, w."""
 
     scale: float = Field(gt=0.0)
-    quat_xyzw: tuple[float, float, float, float]
+    quat_xyzw: Annotated[tuple[float, float, float, float], AfterValidator(_unit_quaternion)]
     translation_m: tuple[float, float, float]
+
+    @staticmethod
+    def of(sim3: Sim3) -> Sim3Record:
+        """The record of a similarity."""
+        x, y, z, w = map(float, quat_xyzw_from_rotations(sim3.rotation))
+        tx, ty, tz = map(float, sim3.translation_m)
+        return Sim3Record(scale=float(sim3.scale), quat_xyzw=(x, y, z, w), translation_m=(tx, ty, tz))
+
+    def to_sim3(self) -> Sim3:
+        """The similarity of the record, equal to the original to about 1e-15."""
+        return Sim3(self.scale, rotations_from_quat_xyzw(np.array(self.quat_xyzw)), np.array(self.translation_m))
 
 
 class CameraRecord(_Model):
@@ -67,16 +125,34 @@ class CameraRecord(_Model):
     cy_px: float
     distortion: tuple[float, float, float, float, float]
 
+    @staticmethod
+    def of(camera: Camera) -> CameraRecord:
+        """The record of a camera."""
+        return CameraRecord(**{name: getattr(camera, name) for name in CameraRecord.model_fields})
+
+    def to_camera(self) -> Camera:
+        """The camera of the record."""
+        return Camera(**dict(self))
+
 
 class PartRecord(_Model):
-    """One content-addressed binary part; a cell part also names its 128 m UTM cell."""
+    """One content-addressed binary part; a cell part also names its 128 m UTM cell.
 
-    kind: Literal["cell", "full"]
+    Kinds of part that a newer minor version brings are carried and hashed, but not read.
+    """
+
+    kind: PartKind  # "cell", "full"
     sha256: Sha256
     size_bytes: int = Field(gt=0, le=MAX_PART_BYTES)
-    cell: tuple[int, int] | None = None  # floor(easting / 128), floor(northing / 128)
-    keyframes: int = Field(ge=0)
-    landmarks: int = Field(ge=0)
+    cell: tuple[CellNumber, CellNumber] | None = None  # floor(easting / 128), floor(northing / 128)
+    keyframes: int = Field(ge=0, le=MAX_INDEX)
+    landmarks: int = Field(ge=0, le=MAX_INDEX)
+
+    @model_validator(mode="after")
+    def _cell_parts_name_their_cell(self) -> PartRecord:
+        if (self.kind == "cell") != (self.cell is not None):
+            raise ValueError("a part names a cell if, and only if, it is a cell part")
+        return self
 
 
 class Quality(_Model):
@@ -103,9 +179,9 @@ class Provenance(_Model):
     drive_sha256: Sha256 | None = None
     fleetmap_version: str
     settings: dict[str, Any]
-    start_ns: int
-    end_ns: int
-    created_ns: int
+    start_ns: Int64
+    end_ns: Int64
+    created_ns: Int64
 
 
 class Manifest(_Model):
@@ -116,15 +192,26 @@ class Manifest(_Model):
     anchor: AnchorRecord
     map_from_vis: Sim3Record
     camera: CameraRecord
-    bbox_lonlat: tuple[float, float, float, float]  # west, south, east, north of the keyframes, degrees
-    trajectory_lonlat: tuple[tuple[float, float], ...]  # thinned keyframe positions, for the catalogue
+    bbox_lonlat: tuple[LonDeg, LatDeg, LonDeg, LatDeg]  # west, south, east, north of the keyframes, degrees
+    trajectory_lonlat: tuple[tuple[LonDeg, LatDeg], ...]  # thinned keyframe positions, for the catalogue
     parts: tuple[PartRecord, ...] = Field(min_length=1, max_length=MAX_PARTS)
     quality: Quality
     provenance: Provenance
 
+    @model_validator(mode="after")
+    def _parts_are_distinct(self) -> Manifest:
+        cells = [part.cell for part in self.parts if part.kind == "cell"]
+        if len({part.sha256 for part in self.parts}) != len(self.parts) or len(set(cells)) != len(cells):
+            raise ValueError("a part or a cell is listed twice")
+        if sum(part.kind == "full" for part in self.parts) > 1:
+            raise ValueError("there is more than one full part")
+        return self
+
     def to_bytes(self) -> bytes:
         """Canonical JSON: sorted keys, UTF-8, indented, newline at the end."""
-        return (json.dumps(self.model_dump(mode="json"), sort_keys=True, indent=1) + "\n").encode()
+        return (
+            json.dumps(self.model_dump(mode="json"), sort_keys=True, indent=1, allow_nan=False) + "\n"
+        ).encode()
 
 
 def manifest_version(data: bytes) -> str:
@@ -141,16 +228,41 @@ def parse_manifest(data: bytes, origin: str) -> Manifest:
     if len(data) > MAX_MANIFEST_BYTES:
         raise MapPackageError(f"manifest of {origin} is larger than {MAX_MANIFEST_BYTES} bytes")
     try:
-        document = json.loads(data)
-    except (UnicodeDecodeError, ValueError, RecursionError) as error:
+        document = json.loads(data, parse_constant=_refuse_constant)
+    except (ValueError, RecursionError) as error:
         raise MapPackageError(f"manifest of {origin} is not JSON: {error}") from error
     _check_format(document, origin)
+    return make_manifest(document, origin)
+
+
+def check_map_id(map_id: str) -> None:
+    """Refuse a name that cannot be a map's id, before the work of mapping is done.
+
+    Raises:
+        MapPackageError: not 1 to 64 lower-case letters, digits, ``-`` and ``_``, or it begins with ``-`` or ``_``.
+    """
+    if not re.fullmatch(MAP_ID_PATTERN, map_id) or map_id.endswith("\n"):
+        raise MapPackageError(
+            f"{map_id[:80]!r} cannot be a map id; take 1 to 64 of a-z, 0-9, '-' and '_', a letter or digit first"
+        )
+
+
+def make_manifest(fields: object, origin: str) -> Manifest:
+    """A manifest of its fields; ``origin`` says in messages which map it is about.
+
+    Raises:
+        MapPackageError: a field does not hold.
+    """
     try:
-        return Manifest.model_validate(document)
+        return Manifest.model_validate(fields)
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(str(step) for step in first["loc"])
         raise MapPackageError(f"manifest of {origin} does not hold at '{place}': {first['msg']}") from error
+
+
+def _refuse_constant(name: str) -> None:
+    raise ValueError(f"{name} is no JSON number")
 
 
 def _check_format(document: object, origin: str) -> None:

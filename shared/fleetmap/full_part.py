@@ -1,0 +1,114 @@
+"""The "full" part of a map package: all of a VisualMap, without loss, for mapping on. Localizers never fetch it.
+
+Poses and points stay float64 in the map frame; anchor, S and camera stand in the manifest.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.errors import MapPackageError
+from fleetmap.geodesy import UtmAnchor
+from fleetmap.manifest import Manifest
+from fleetmap.parts import decode_part, encode_part
+from fleetmap.visual_map import Keyframes, Landmarks, Observations, VisualMap
+
+# name -> (dtype on disk, group of VisualMap and its length, field, shape of one row)
+_COLUMNS: dict[str, tuple[str, str, str, tuple[int, ...]]] = {
+    "keyframe_stamps_ns": ("<i8", "keyframes", "stamps_ns", ()),
+    "keyframe_rotations": ("<f8", "keyframes", "rotations", (3, 3)),
+    "keyframe_positions_m": ("<f8", "keyframes", "positions_m", (3,)),
+    "landmark_points_m": ("<f8", "landmarks", "points_m", (3,)),
+    "landmark_descriptors": ("|u1", "landmarks", "descriptors", (32,)),
+    "landmark_normals": ("<f4", "landmarks", "normals", (3,)),
+    "landmark_octaves": ("|u1", "landmarks", "octaves", ()),
+    "landmark_distances_m": ("<f4", "landmarks", "distances_m", ()),
+    "observation_keyframe_index": ("<i4", "observations", "keyframe_index", ()),
+    "observation_landmark_index": ("<i4", "observations", "landmark_index", ()),
+    "observation_pixels": ("<f4", "observations", "pixels", (2,)),
+    "observation_octaves": ("|u1", "observations", "octaves", ()),
+}
+_ORTHONORMAL_TOLERANCE = 1e-6
+_MAX_EXTENT_M = 2e6
+
+
+def encode_full(visual_map: VisualMap) -> bytes:
+    """The full part of a map."""
+    arrays = {
+        name: np.asarray(getattr(getattr(visual_map, group), field)).astype(dtype, casting="same_kind")
+        for name, (dtype, group, field, _) in _COLUMNS.items()
+    }
+    return encode_part("full", full_attributes(visual_map.anchor), arrays)
+
+
+def decode_full(data: bytes, manifest: Manifest, origin: str) -> VisualMap:
+    """The map of a full part; ``origin`` says in messages where it came from.
+
+    Raises:
+        MapPackageError: the part is malformed, or belongs to another map than the manifest.
+    """
+    part = decode_part(data, origin)
+    anchor = manifest.anchor.to_anchor()
+    wanted = full_attributes(anchor)
+    if part.kind != "full" or {key: part.attributes.get(key) for key in wanted} != wanted:
+        raise MapPackageError(f"{origin} is not the full part of a map anchored at {anchor}")
+    groups: dict[str, dict[str, NDArray[Any]]] = {"keyframes": {}, "landmarks": {}, "observations": {}}
+    for name, (dtype, group, field, row) in _COLUMNS.items():
+        groups[group][field] = part.array(name, dtype, (None, *row))
+    visual_map = VisualMap(
+        anchor,
+        manifest.map_from_vis.to_sim3(),
+        manifest.camera.to_camera(),
+        Keyframes(**groups["keyframes"]),
+        Landmarks(**groups["landmarks"]),
+        Observations(**groups["observations"]),
+    )
+    check_visual_map(visual_map, origin)
+    return visual_map
+
+
+def full_attributes(anchor: UtmAnchor) -> dict[str, Any]:
+    """What the header of a full part says about its frame."""
+    return {"epsg": anchor.epsg, "anchor_m": [anchor.easting_m, anchor.northing_m, anchor.height_m]}
+
+
+def check_visual_map(visual_map: VisualMap, origin: str) -> None:
+    """Hold a map against what visual_map.py promises: parallel, finite arrays, indices in range and sorted.
+
+    Raises:
+        MapPackageError: what does not hold.
+    """
+    for name, (dtype, group, field, row) in _COLUMNS.items():
+        rows, values = len(getattr(visual_map, group)), getattr(getattr(visual_map, group), field)
+        if values.shape != (rows, *row):
+            raise MapPackageError(f"{origin}: '{name}' has shape {values.shape} instead of {(rows, *row)}")
+        if dtype[1] == "f" and not np.isfinite(values).all():
+            raise MapPackageError(f"{origin}: '{name}' holds numbers that are not finite")
+    if (np.abs(visual_map.keyframes.positions_m) > _MAX_EXTENT_M).any():
+        raise MapPackageError(f"{origin}: a keyframe lies more than 2,000 km from the map's anchor")
+    check_rotations(visual_map.keyframes.rotations, origin)
+    observations = visual_map.observations
+    check_indices(observations.keyframe_index, len(visual_map.keyframes), "observed keyframes", origin)
+    check_indices(observations.landmark_index, len(visual_map.landmarks), "observed landmarks", origin)
+    if (np.diff(observations.keyframe_index) < 0).any():
+        raise MapPackageError(f"{origin}: observations are not sorted by keyframe")
+    if (np.diff(visual_map.keyframes.stamps_ns) <= 0).any():
+        raise MapPackageError(f"{origin}: keyframes are not in time order")
+    if (visual_map.landmarks.distances_m < 0.0).any():
+        raise MapPackageError(f"{origin}: landmarks were seen from a negative distance")
+
+
+def check_rotations(rotations: NDArray[np.float64], origin: str) -> None:
+    """Refuse matrices (K, 3, 3) that are no rotations."""
+    gram = rotations @ rotations.transpose(0, 2, 1)
+    if not (np.abs(gram - np.eye(3)) < _ORTHONORMAL_TOLERANCE).all() or (np.linalg.det(rotations) < 0.0).any():
+        raise MapPackageError(f"{origin}: keyframe orientations are no rotations")
+
+
+def check_indices(indices: NDArray[Any], count: int, what: str, origin: str) -> None:
+    """Refuse indices outside [0, count)."""
+    if len(indices) and (int(indices.min()) < 0 or int(indices.max()) >= count):
+        raise MapPackageError(f"{origin}: {what} lie outside the {count} there are")

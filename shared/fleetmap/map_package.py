@@ -1,0 +1,306 @@
+"""A map package: a folder with ``manifest.json`` and content-addressed parts, ``parts/<sha256>.bin``.
+
+There is one part per 128 m UTM cell that holds keyframes (see fleetmap.cells: what a localizer needs) and one
+full part (see fleetmap.full_part: everything, for mapping on). The map's version is the SHA-256 of the
+manifest's bytes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.cells import decode_cell, encode_cell, merge_cells, split_into_cells
+from fleetmap.errors import MapPackageError, OutputExistsError
+from fleetmap.files import atomic_path, refuse_existing
+from fleetmap.full_part import check_visual_map, decode_full, encode_full
+from fleetmap.geodesy import UtmGrid
+from fleetmap.manifest import (
+    MAX_MANIFEST_BYTES,
+    MAX_PART_BYTES,
+    AnchorRecord,
+    CameraRecord,
+    Manifest,
+    PartRecord,
+    Provenance,
+    Quality,
+    Sim3Record,
+    check_map_id,
+    make_manifest,
+    manifest_version,
+    parse_manifest,
+)
+from fleetmap.visual_map import LocalizationMap, VisualMap
+
+MANIFEST_NAME = "manifest.json"
+PARTS_NAME = "parts"
+_TRAJECTORY_SPACING_M = 10.0
+
+
+@dataclass(frozen=True)
+class MapPackage:
+    """An opened package: its manifest is checked, its parts are checked whenever they are read."""
+
+    folder: Path
+    manifest: Manifest
+    manifest_bytes: bytes
+
+    @property
+    def version(self) -> str:
+        """SHA-256 of the manifest's bytes, in hex."""
+        return manifest_version(self.manifest_bytes)
+
+    def part_bytes(self, sha256: str) -> bytes:
+        """The bytes of one part of the manifest.
+
+        Raises:
+            MapPackageError: the manifest does not list it, the file is missing, or its size or hash is another.
+        """
+        for record in self.manifest.parts:
+            if record.sha256 == sha256:
+                return self._read(record)
+        raise MapPackageError(f"the manifest of {self.folder} lists no part {sha256[:64]!r}")
+
+    def localization_map(self) -> LocalizationMap:
+        """All cells, merged into what a localizer needs.
+
+        Raises:
+            MapPackageError: a cell part is missing or damaged.
+        """
+        records = [record for record in self.manifest.parts if record.kind == "cell"]
+        return decode_cells(self.manifest, [self._read(record) for record in records])
+
+    def visual_map(self) -> VisualMap:
+        """The whole map from the full part, equal to the one that was written.
+
+        Raises:
+            MapPackageError: the package has no full part, or it is damaged.
+        """
+        for record in self.manifest.parts:
+            if record.kind == "full":
+                return decode_full(self._read(record), self.manifest, str(self._path(record)))
+        raise MapPackageError(f"{self.folder} holds no full part, only cells; mapping on needs the whole package")
+
+    def _path(self, record: PartRecord) -> Path:
+        return self.folder / PARTS_NAME / f"{record.sha256}.bin"
+
+    def _read(self, record: PartRecord) -> bytes:
+        path = self._path(record)
+        data = _read_file(path, record.size_bytes)
+        if len(data) != record.size_bytes:
+            raise MapPackageError(
+                f"{path} is not the {record.size_bytes} bytes long that the manifest says; {_AGAIN}"
+            )
+        if hashlib.sha256(data).hexdigest() != record.sha256:
+            raise MapPackageError(f"{path} is damaged or was tampered with: its SHA-256 is another; {_AGAIN}")
+        return data
+
+
+_AGAIN = "copy or download the map again"
+
+
+def write_package(
+    folder: Path,
+    visual_map: VisualMap,
+    *,
+    map_id: str,
+    quality: Quality,
+    provenance: Provenance,
+    force: bool = False,
+) -> Manifest:
+    """Write a map as a package. The folder is there whole or not at all; the same map gives the same bytes.
+
+    Raises:
+        OutputExistsError: the folder exists and ``force`` is not given, or what exists is not a map package.
+        MapPackageError: the map is empty, contradicts itself or its quality record, or ``map_id`` is no map id.
+        StorageError: the disk is full or refuses.
+    """
+    check_map_id(map_id)
+    target = folder.resolve()
+    _refuse_foreign(target, force)
+    parts, manifest = _encode(visual_map, map_id, quality, provenance)
+    manifest_bytes = manifest.to_bytes()
+    if len(manifest_bytes) > MAX_MANIFEST_BYTES:
+        raise MapPackageError(f"manifest of map '{map_id}' exceeds {MAX_MANIFEST_BYTES} bytes; split the drive")
+    with atomic_path(target) as draft:
+        (draft / PARTS_NAME).mkdir(parents=True)
+        for record, data in zip(manifest.parts, parts, strict=True):
+            _write_file(draft / PARTS_NAME / f"{record.sha256}.bin", data)
+        _write_file(draft / MANIFEST_NAME, manifest_bytes)
+    return manifest
+
+
+def open_package(folder: Path) -> MapPackage:
+    """Open a package; its parts are read later, when they are asked for.
+
+    Raises:
+        MapPackageError: no package there, or its manifest does not hold.
+    """
+    if not folder.is_dir():
+        raise MapPackageError(f"there is no map package at {folder}; make one with 'fleetmap map'")
+    if not (folder / MANIFEST_NAME).exists():
+        raise MapPackageError(f"{folder} is no map package: it holds no {MANIFEST_NAME}")
+    manifest_bytes = _read_file(folder / MANIFEST_NAME, MAX_MANIFEST_BYTES)
+    return MapPackage(folder, parse_manifest(manifest_bytes, str(folder)), manifest_bytes)
+
+
+def decode_cells(manifest: Manifest, parts: Sequence[bytes]) -> LocalizationMap:
+    """Cell parts of a map, as read or fetched in any order and number, merged into what a localizer needs.
+
+    Raises:
+        MapPackageError: bytes that are no cell part of this manifest, or that do not decode.
+    """
+    anchor = manifest.anchor.to_anchor()
+    records = {record.sha256: record for record in manifest.parts if record.kind == "cell"}
+    fetched = {hashlib.sha256(data).hexdigest(): data for data in parts}
+    cells = []
+    for sha256 in sorted(fetched):
+        if sha256 not in records:
+            raise MapPackageError(
+                f"bytes with SHA-256 {sha256} are no cell part of map '{manifest.map_id}'; {_AGAIN}"
+            )
+        origin = f"part {sha256}.bin of map '{manifest.map_id}'"
+        cells.append(decode_cell(fetched[sha256], records[sha256], anchor, origin))
+    return merge_cells(anchor, cells)
+
+
+def verify_package(package: MapPackage) -> None:
+    """Read every part: all present, undamaged, decodable, and holding as much as the manifest says.
+
+    Raises:
+        MapPackageError: what does not hold, and in which file.
+    """
+    manifest, origin = package.manifest, str(package.folder)
+    for record in manifest.parts:
+        if record.kind not in ("cell", "full"):
+            package.part_bytes(record.sha256)
+    counted = {"keyframes of all cells": len(package.localization_map().keyframes)}
+    visual_map = package.visual_map()
+    full = next(record for record in manifest.parts if record.kind == "full")
+    counted |= {"keyframes of the full part": full.keyframes, "keyframes read": len(visual_map.keyframes)}
+    _agree(manifest.quality.keyframes, counted, origin)
+    _agree(
+        manifest.quality.landmarks,
+        {"landmarks of the full part": full.landmarks, "landmarks read": len(visual_map.landmarks)},
+        origin,
+    )
+    _agree(manifest.quality.observations, {"observations read": len(visual_map.observations)}, origin)
+
+
+def _agree(wanted: int, counted: dict[str, int], origin: str) -> None:
+    for what, count in counted.items():
+        if count != wanted:
+            raise MapPackageError(f"{origin} contradicts itself: {count} {what}, its quality record says {wanted}")
+
+
+def _encode(
+    visual_map: VisualMap, map_id: str, quality: Quality, provenance: Provenance
+) -> tuple[list[bytes], Manifest]:
+    """All parts, cells in order and the full one last, and the manifest that lists them in the same order."""
+    origin = f"map '{map_id}'"
+    check_visual_map(visual_map, origin)
+    if len(visual_map.keyframes) == 0:
+        raise MapPackageError(f"{origin} holds no keyframes")
+    keyframes, landmarks, observations = visual_map.keyframes, visual_map.landmarks, visual_map.observations
+    _agree(quality.keyframes, {"keyframes": len(keyframes)}, origin)
+    _agree(quality.landmarks, {"landmarks": len(landmarks)}, origin)
+    _agree(quality.observations, {"observations": len(observations)}, origin)
+    parts, records = [], []
+    for index, cell in split_into_cells(visual_map).items():
+        parts.append(encode_cell(index, cell, visual_map.anchor))
+        records.append(_record("cell", parts[-1], len(cell.keyframe_ids), len(cell.landmark_ids), index))
+    parts.append(encode_full(visual_map))
+    records.append(_record("full", parts[-1], len(keyframes), len(landmarks), None))
+    lonlat = _keyframes_lonlat(visual_map)
+    manifest = make_manifest(
+        {
+            "map_id": map_id,
+            "anchor": AnchorRecord.of(visual_map.anchor),
+            "map_from_vis": Sim3Record.of(visual_map.map_from_vis),
+            "camera": CameraRecord.of(visual_map.camera),
+            "bbox_lonlat": _bounding_box(lonlat),
+            "trajectory_lonlat": lonlat[_thin(keyframes.positions_m)].tolist(),
+            "parts": records,
+            "quality": quality,
+            "provenance": provenance,
+        },
+        origin,
+    )
+    return parts, manifest
+
+
+def _record(
+    kind: str, data: bytes, keyframes: int, landmarks: int, cell: tuple[int, int] | None
+) -> dict[str, object]:
+    if len(data) > MAX_PART_BYTES:
+        raise MapPackageError(f"a '{kind}' part of {len(data)} bytes exceeds {MAX_PART_BYTES}; split the drive")
+    return {
+        "kind": kind,
+        "sha256": hashlib.sha256(data).hexdigest(),
+        "size_bytes": len(data),
+        "cell": cell,
+        "keyframes": keyframes,
+        "landmarks": landmarks,
+    }
+
+
+def _keyframes_lonlat(visual_map: VisualMap) -> NDArray[np.float64]:
+    """Longitude and latitude (K, 2) of the keyframes in degrees, to about a centimetre."""
+    in_utm = visual_map.anchor.utm_from_map(visual_map.keyframes.positions_m)
+    lat_deg, lon_deg, _ = UtmGrid(visual_map.anchor.epsg).to_geodetic(in_utm)
+    return np.asarray(np.stack([lon_deg, lat_deg], axis=1).round(7), dtype=np.float64)
+
+
+def _bounding_box(lonlat: NDArray[np.float64]) -> tuple[float, float, float, float]:
+    """West, south, east, north; across the antimeridian west is greater than east (RFC 7946, section 5.2)."""
+    lon_deg, lat_deg = lonlat[:, 0], lonlat[:, 1]
+    east_half = lon_deg[lon_deg > 0.0]
+    if np.ptp(lon_deg) > 180.0:
+        return (
+            float(east_half.min()),
+            float(lat_deg.min()),
+            float(lon_deg[lon_deg <= 0.0].max()),
+            float(lat_deg.max()),
+        )
+    return float(lon_deg.min()), float(lat_deg.min()), float(lon_deg.max()), float(lat_deg.max())
+
+
+def _thin(positions_m: NDArray[np.float64]) -> list[int]:
+    """Indices of positions about 10 m apart, the first and the last among them."""
+    kept = [0]
+    for index, position in enumerate(positions_m):
+        if np.linalg.norm(position - positions_m[kept[-1]]) >= _TRAJECTORY_SPACING_M:
+            kept.append(index)
+    return kept if kept[-1] == len(positions_m) - 1 else [*kept, len(positions_m) - 1]
+
+
+def _refuse_foreign(target: Path, force: bool) -> None:
+    """``force`` replaces a map package or an empty folder, and never anything else of the user's."""
+    refuse_existing(target, force)
+    is_ours = target.is_dir() and ((target / MANIFEST_NAME).is_file() or not any(target.iterdir()))
+    if target.exists() and not is_ours:
+        raise OutputExistsError(f"{target} is not a map package, --force will not replace it; give another name")
+
+
+def _read_file(path: Path, limit_bytes: int) -> bytes:
+    """A file's bytes, at most one more than the limit: enough to tell that a file is too long."""
+    if not path.is_file():
+        raise MapPackageError(f"{path} is missing; {_AGAIN}")
+    try:
+        with path.open("rb") as file:
+            return file.read(limit_bytes + 1)
+    except OSError as error:
+        raise MapPackageError(f"{path} cannot be read: {error.strerror or error}") from error
+
+
+def _write_file(path: Path, data: bytes) -> None:
+    with path.open("wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
