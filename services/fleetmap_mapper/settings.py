@@ -1,0 +1,85 @@
+"""Every knob of the mapper in one place; written into each map's provenance."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+GnssMode = Literal["none", "final", "full"]
+
+
+class _Group(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class FeatureGroup(_Group):
+    """What is extracted from every image."""
+
+    count: int = Field(default=2000, ge=200, le=10_000)
+
+
+class InitialisationGroup(_Group):
+    """When two views make a first map."""
+
+    min_matches: int = 100
+    min_points: int = 60
+
+
+class TrackingGroup(_Group):
+    """How a frame is held against the local map."""
+
+    search_radius_px: float = 15.0  # about the position predicted by constant velocity, at octave 0
+    refined_radius_px: float = 4.0  # about the position predicted by the first pose
+    min_inliers: int = 25
+    max_hamming: int = 80
+    match_ratio: float = 0.9
+    local_keyframes: int = 25
+
+
+class KeyframeGroup(_Group):
+    """When a frame becomes a keyframe: whichever comes first."""
+
+    min_tracked_ratio: float = 0.8  # of what the last keyframe held
+    max_rotation_deg: float = 4.0
+    max_translation_to_depth: float = 0.08  # against the median depth of the tracked landmarks
+
+
+class MappingGroup(_Group):
+    """How a new keyframe extends and tightens the map."""
+
+    neighbours: int = 8  # keyframes that new landmarks are triangulated with
+    min_parallax_px: float = 10.0  # angle between the rays, expressed at the image centre
+    max_hamming: int = 60
+    window: int = 12  # keyframes that the local adjustment moves
+    min_observations: int = 3  # a landmark that never gets there is dropped
+
+
+class GnssGroup(_Group):
+    """How fixes enter."""
+
+    mode: GnssMode = "full"
+    align_every: int = 5  # keyframes between two light alignments while mapping
+    level_sigma_deg: float = 2.0  # how level the camera's horizontal axis is on average over a drive
+
+
+class QualityGroup(_Group):
+    """When a map is fit to publish."""
+
+    min_posed_ratio: float = 0.95
+    max_reprojection_rms_px: float = 2.0
+    max_gnss_residual_sigmas: float = 4.0  # RMS of the residuals over their own sigma
+    max_unposed_gap_s: float = 2.0
+
+
+class MapperSettings(_Group):
+    """All groups."""
+
+    seed: int = 0
+    features: FeatureGroup = FeatureGroup()
+    initialisation: InitialisationGroup = InitialisationGroup()
+    tracking: TrackingGroup = TrackingGroup()
+    keyframes: KeyframeGroup = KeyframeGroup()
+    mapping: MappingGroup = MappingGroup()
+    gnss: GnssGroup = GnssGroup()
+    quality: QualityGroup = QualityGroup()
