@@ -7,6 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fleetmap.camera import Camera
+from fleetmap.drive import GnssFix
+from fleetmap.drives.ros2_writer import DriveWriter
+from fleetmap.geodesy import UtmGrid
 from fleetmap.geometry import so3_exp
 from fleetmap.trajectory import Trajectory, write_trajectory
 from fleetmap_cli.main import main
@@ -89,6 +93,30 @@ def test_sim3_alignment_takes_a_shift_away_and_reports_the_scale(capsys: pytest.
     figures = json.loads(capsys.readouterr().out)["reference"]
     assert figures["position_m"]["max"] < 1e-5
     assert figures["scale"] == pytest.approx(1.0, abs=1e-6)
+
+
+def test_the_spline_through_the_recorded_fixes_stands_beside(
+    files: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    truth = straight_drive()
+    # A fix a second, 0.75 m west of the camera: on a straight road the spline errs by just that.
+    lat_deg, lon_deg, height_m = UtmGrid(truth.epsg).to_geodetic(truth.positions_m[5:46:10] - [0.75, 0.0, 0.0])
+    fixes = zip(truth.stamps_ns[5:46:10].tolist(), lat_deg, lon_deg, height_m, strict=True)
+    with DriveWriter(files / "drive.mcap", Camera(64, 48, 50.0, 50.0, 31.5, 23.5)) as writer:
+        writer.write_image(int(truth.stamps_ns[0]), np.zeros((48, 64), dtype=np.uint8))
+        for stamp_ns, lat, lon, height in fixes:
+            writer.write_fix(GnssFix(stamp_ns, lat, lon, height, np.eye(3) * 0.0025), "camera")
+    judged = ["estimate.tum", "reference.tum", "--spline-through", "drive.mcap"]
+    assert run(*judged, "--json") == 0
+    spline = json.loads(capsys.readouterr().out)["spline"]
+    assert spline["position_m"]["mean"] == pytest.approx(0.75, abs=1e-4)
+    assert (spline["matched"], spline["comparable"]) == (41, 50)
+    assert "rotation_deg" not in spline
+    assert run(*judged, "--plot", "out.png") == 0
+    out = capsys.readouterr().out
+    assert out.splitlines()[1].split() == ["3-D", "horizontal", "spline", "3-D", "spline", "horizontal"]
+    assert "spline coverage: 41 of 50" in out
+    assert (files / "out.png").is_file()
 
 
 def test_the_plot_is_a_picture_and_replaces_an_older_one(files: Path) -> None:

@@ -143,11 +143,12 @@ def _require_sensible_options(
 
 
 def _judge_spline(recording: Path, reference: Trajectory) -> TrajectoryErrors:
-    with _needing("--spline-through", "recordings"):
-        from fleetmap.drives import open_drive
+    from fleetmap.drives import open_drive
     from fleetmap.yardstick import evaluate_gnss_spline
 
-    return evaluate_gnss_spline(open_drive(recording).gnss_fixes(), reference)
+    with _needing("--spline-through", "recordings"):
+        fixes = open_drive(recording).gnss_fixes()
+    return evaluate_gnss_spline(fixes, reference)
 
 
 def _require_drawable(plot: Path) -> None:
