@@ -109,6 +109,11 @@ class Ros2Drive:
             stamp_before_ns = stamp_ns
             yield Frame(stamp_ns, image)
 
+    def decode_first_image(self) -> image_codec.Image:
+        """The first image, also of a recording without calibration. Raises DriveError if it cannot be decoded."""
+        message = first_message(self.mcap, self.image_topic)
+        return self._decode(0, stamp_ns_of(message.header), message)
+
     def frame_stamps_ns(self) -> list[int]:
         """The images' header stamps in the order of the recording, unchecked; nothing is decoded."""
         decoder = MessageDecoder(self.mcap.topics[self.image_topic])
@@ -116,22 +121,17 @@ class Ros2Drive:
         return [stamp_ns_of(decoder.decode(raw.data, raw.log_time_ns).header) for raw in raws]
 
     def gnss_fixes(self) -> list[GnssFix]:
-        """All valid fixes in time order (of several with one stamp the first); empty without GNSS.
+        """All valid fixes in time order; empty without GNSS.
 
         Raises:
             DriveError: several GNSS topics and none was chosen.
         """
-        return self._gnss[0]
+        return self._fixes
 
     @property
     def gnss_topic(self) -> str | None:
         """The topic of the fixes; None without GNSS. Raises DriveError where it has to be chosen."""
         return choose_gnss_topic(self.mcap, self._wanted_gnss_topic)
-
-    @property
-    def dropped_fix_count(self) -> int:
-        """NavSatFix messages that said there was no fix, or held no finite position, or repeated a stamp."""
-        return self._gnss[1]
 
     def antenna(self) -> Antenna:
         """Where the antenna sits in the camera's frame; a guess is warned about once.
@@ -142,19 +142,9 @@ class Ros2Drive:
         return self._antenna
 
     @cached_property
-    def _gnss(self) -> tuple[list[GnssFix], int]:
+    def _fixes(self) -> list[GnssFix]:
         topic = self.gnss_topic
-        if topic is None:
-            return [], 0
-        decoder = MessageDecoder(self.mcap.topics[topic])
-        by_stamp: dict[int, GnssFix] = {}
-        for raw in self.mcap.messages(topic):
-            fix = fix_from_nav_sat_fix(decoder.decode(raw.data, raw.log_time_ns))
-            if fix is not None:
-                by_stamp.setdefault(fix.stamp_ns, fix)
-        return [by_stamp[stamp] for stamp in sorted(by_stamp)], self.mcap.topics[topic].message_count - len(
-            by_stamp
-        )
+        return read_fixes(self.mcap, topic) if topic else []
 
     @cached_property
     def _antenna(self) -> Antenna:
@@ -225,6 +215,17 @@ class Ros2Drive:
 
     def _image(self, index: int, stamp_ns: int) -> str:
         return f"image {index} of {self.image_topic} in {self.path} (stamp {stamp_ns} ns)"
+
+
+def read_fixes(mcap: McapFile, topic: str) -> list[GnssFix]:
+    """All valid fixes of a NavSatFix topic in time order; of several with one stamp, the first."""
+    decoder = MessageDecoder(mcap.topics[topic])
+    by_stamp: dict[int, GnssFix] = {}
+    for raw in mcap.messages(topic):
+        fix = fix_from_nav_sat_fix(decoder.decode(raw.data, raw.log_time_ns))
+        if fix is not None:
+            by_stamp.setdefault(fix.stamp_ns, fix)
+    return [by_stamp[stamp_ns] for stamp_ns in sorted(by_stamp)]
 
 
 def _is_rectified(image_topic: str) -> bool:
