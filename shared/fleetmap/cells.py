@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.errors import MapPackageError
-from fleetmap.full_part import check_indices
+from fleetmap.full_part import MAX_EXTENT_M, check_ascending, check_indices
 from fleetmap.geodesy import UtmAnchor
 from fleetmap.geometry import quat_xyzw_from_rotations, rotations_from_quat_xyzw
 from fleetmap.manifest import CELL_SIZE_M, MAX_INDEX, PartRecord
@@ -63,15 +63,9 @@ def split_into_cells(visual_map: VisualMap) -> dict[CellIndex, Cell]:
 
 
 def encode_cell(index: CellIndex, cell: Cell, anchor: UtmAnchor) -> bytes:
-    """The part of one cell.
-
-    Raises:
-        MapPackageError: a landmark lies so far away (2,000 km) that it cannot be one.
-    """
+    """The part of one cell of a map that passed check_visual_map."""
     offset_m = _corner_m(index) - anchor.offset_m
     points_mm = np.rint(cell.landmarks.points_m * _MM_PER_M) - offset_m * _MM_PER_M
-    if len(points_mm) and np.abs(points_mm).max() > np.iinfo(np.int32).max:
-        raise MapPackageError(f"a landmark of cell {index} lies more than 2,000 km away; the map is broken")
     arrays = {
         "keyframe_ids": cell.keyframe_ids.astype("<u4"),
         "keyframe_stamps_ns": cell.keyframes.stamps_ns.astype("<i8"),
@@ -119,7 +113,7 @@ def merge_cells(anchor: UtmAnchor, cells: Sequence[Cell]) -> LocalizationMap:
     """One map of any cells of a package; each landmark appears once, keyframes are in time order.
 
     Raises:
-        MapPackageError: two cells claim the same keyframe.
+        MapPackageError: two cells claim the same keyframe, or their clocks disagree with their keyframes' order.
     """
     cells = [_EMPTY_CELL, *cells]
     all_keyframe_ids = np.concatenate([cell.keyframe_ids for cell in cells])
@@ -132,9 +126,11 @@ def merge_cells(anchor: UtmAnchor, cells: Sequence[Cell]) -> LocalizationMap:
     seen_by_keyframe = np.concatenate([cell.keyframe_ids[cell.seen_by_keyframe] for cell in cells])
     seen_landmark = np.concatenate([cell.landmark_ids[cell.seen_landmark] for cell in cells])
     order = np.lexsort((seen_landmark, seen_by_keyframe))
+    keyframes = _take(_joined([cell.keyframes for cell in cells]), keyframe_rows)
+    check_ascending(keyframes.stamps_ns, "keyframe stamps", "the map merged of its cells")
     return LocalizationMap(
         anchor,
-        _take(_joined([cell.keyframes for cell in cells]), keyframe_rows),
+        keyframes,
         _take(_joined([cell.landmarks for cell in cells]), landmark_rows),
         np.searchsorted(keyframe_ids, seen_by_keyframe[order]).astype(np.int32),
         np.searchsorted(landmark_ids, seen_landmark[order]).astype(np.int32),
@@ -159,10 +155,11 @@ def _cut_out(visual_map: VisualMap, keyframe_ids: Ids, observed: Ids) -> Cell:
 
 def _read_keyframes(part: Part, count: int, offset_m: NDArray[np.float64]) -> Keyframes:
     positions_in_cell = part.array("keyframe_positions_m", "<f8", (count, 3))
-    if ((positions_in_cell[:, :2] < 0.0) | (positions_in_cell[:, :2] > CELL_SIZE_M)).any():
+    lowest, highest = (0.0, 0.0, -MAX_EXTENT_M), (CELL_SIZE_M, CELL_SIZE_M, MAX_EXTENT_M)
+    if ((positions_in_cell < lowest) | (positions_in_cell > highest)).any():
         raise MapPackageError(f"{part.origin}: a keyframe lies outside the cell")
     quat_xyzw = part.array("keyframe_quat_xyzw", "<f8", (count, 4))
-    if (np.abs(np.linalg.norm(quat_xyzw, axis=1) - 1.0) > _UNIT_TOLERANCE).any():
+    if (np.abs(np.linalg.norm(quat_xyzw.clip(-2.0, 2.0), axis=1) - 1.0) > _UNIT_TOLERANCE).any():
         raise MapPackageError(f"{part.origin}: keyframe orientations are no unit quaternions")
     rotations = rotations_from_quat_xyzw(quat_xyzw) if count else np.empty((0, 3, 3))
     return Keyframes(part.array("keyframe_stamps_ns", "<i8", (count,)), rotations, positions_in_cell + offset_m)
@@ -186,8 +183,7 @@ def _read_landmarks(part: Part, count: int, offset_m: NDArray[np.float64]) -> La
 def _read_ids(part: Part, name: str, count: int) -> Ids:
     ids = part.array(name, "<u4", (count,)).astype(np.int64)
     check_indices(ids, MAX_INDEX, name, part.origin)
-    if (np.diff(ids) <= 0).any():
-        raise MapPackageError(f"{part.origin}: '{name}' are not ascending")
+    check_ascending(ids, name, part.origin)
     return ids
 
 
@@ -197,8 +193,7 @@ def _read_pairs(part: Part, keyframes: int, landmarks: int) -> tuple[Ids, Ids]:
     seen_landmark = part.array("seen_landmark", "<u4", (len(seen_by_keyframe),)).astype(np.int64)
     check_indices(seen_by_keyframe, keyframes, "observing keyframes", part.origin)
     check_indices(seen_landmark, landmarks, "observed landmarks", part.origin)
-    if (np.diff(seen_by_keyframe << 32 | seen_landmark) <= 0).any():
-        raise MapPackageError(f"{part.origin}: who sees what is not sorted")
+    check_ascending(seen_by_keyframe << 32 | seen_landmark, "pairs of keyframe and landmark", part.origin)
     return seen_by_keyframe, seen_landmark
 
 

@@ -32,7 +32,7 @@ _COLUMNS: dict[str, tuple[str, str, str, tuple[int, ...]]] = {
     "observation_octaves": ("|u1", "observations", "octaves", ()),
 }
 _ORTHONORMAL_TOLERANCE = 1e-6
-_MAX_EXTENT_M = 2e6
+MAX_EXTENT_M = 1e6  # from the anchor, along each axis; millimetres from any cell of the map fit an int32
 
 
 def encode_full(visual_map: VisualMap) -> bytes:
@@ -87,22 +87,27 @@ def check_visual_map(visual_map: VisualMap, origin: str) -> None:
             raise MapPackageError(f"{origin}: '{name}' has shape {values.shape} instead of {(rows, *row)}")
         if dtype[1] == "f" and not np.isfinite(values).all():
             raise MapPackageError(f"{origin}: '{name}' holds numbers that are not finite")
-    if (np.abs(visual_map.keyframes.positions_m) > _MAX_EXTENT_M).any():
-        raise MapPackageError(f"{origin}: a keyframe lies more than 2,000 km from the map's anchor")
+    for points_m, what in (
+        (visual_map.keyframes.positions_m, "keyframe"),
+        (visual_map.landmarks.points_m, "landmark"),
+    ):
+        if (np.abs(points_m) > MAX_EXTENT_M).any():
+            raise MapPackageError(f"{origin}: a {what} lies more than 1,000 km from the map's anchor")
     check_rotations(visual_map.keyframes.rotations, origin)
     observations = visual_map.observations
     check_indices(observations.keyframe_index, len(visual_map.keyframes), "observed keyframes", origin)
     check_indices(observations.landmark_index, len(visual_map.landmarks), "observed landmarks", origin)
     if (np.diff(observations.keyframe_index) < 0).any():
         raise MapPackageError(f"{origin}: observations are not sorted by keyframe")
-    if (np.diff(visual_map.keyframes.stamps_ns) <= 0).any():
-        raise MapPackageError(f"{origin}: keyframes are not in time order")
+    check_ascending(visual_map.keyframes.stamps_ns, "keyframe stamps", origin)
     if (visual_map.landmarks.distances_m < 0.0).any():
         raise MapPackageError(f"{origin}: landmarks were seen from a negative distance")
 
 
 def check_rotations(rotations: NDArray[np.float64], origin: str) -> None:
     """Refuse matrices (K, 3, 3) that are no rotations."""
+    if (np.abs(rotations) > 2.0).any():
+        raise MapPackageError(f"{origin}: keyframe orientations are no rotations")
     gram = rotations @ rotations.transpose(0, 2, 1)
     if not (np.abs(gram - np.eye(3)) < _ORTHONORMAL_TOLERANCE).all() or (np.linalg.det(rotations) < 0.0).any():
         raise MapPackageError(f"{origin}: keyframe orientations are no rotations")
@@ -112,3 +117,9 @@ def check_indices(indices: NDArray[Any], count: int, what: str, origin: str) -> 
     """Refuse indices outside [0, count)."""
     if len(indices) and (int(indices.min()) < 0 or int(indices.max()) >= count):
         raise MapPackageError(f"{origin}: {what} lie outside the {count} there are")
+
+
+def check_ascending(numbers: NDArray[np.int64], what: str, origin: str) -> None:
+    """Refuse numbers of which one is not greater than the one before; differences could overflow."""
+    if (numbers[1:] <= numbers[:-1]).any():
+        raise MapPackageError(f"{origin}: {what} are not ascending")

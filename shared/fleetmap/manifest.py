@@ -26,7 +26,7 @@ from pydantic import (
 from fleetmap.camera import Camera
 from fleetmap.errors import MapPackageError
 from fleetmap.geodesy import UtmAnchor
-from fleetmap.geometry import Sim3, quat_xyzw_from_rotations, rotations_from_quat_xyzw
+from fleetmap.geometry import Sim3, rotations_from_quat_xyzw
 
 FORMAT_NAME = "fleetmap-map"
 FORMAT_MAJOR, FORMAT_MINOR = 1, 0
@@ -35,7 +35,6 @@ MAX_MANIFEST_BYTES = 16 * 1024 * 1024
 MAX_PART_BYTES = 512 * 1024 * 1024
 MAX_PARTS = 100_000
 MAP_ID_PATTERN = r"^[a-z0-9][a-z0-9_-]{0,63}$"
-
 MAX_INDEX = 2**31 - 1  # keyframes and landmarks are counted in int32
 
 Sha256 = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
@@ -60,6 +59,14 @@ def _unit_quaternion(quat_xyzw: tuple[float, float, float, float]) -> tuple[floa
     return quat_xyzw
 
 
+def _plain_json(settings: dict[str, Any]) -> dict[str, Any]:
+    try:
+        json.dumps(settings, allow_nan=False, ensure_ascii=False).encode()
+    except (TypeError, ValueError, RecursionError) as error:
+        raise ValueError(f"not plain JSON: {error}") from error
+    return settings
+
+
 class _Model(BaseModel):
     model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
 
@@ -78,17 +85,7 @@ class AnchorRecord(_Model):
     epsg: Annotated[int, AfterValidator(_utm_zone)]
     easting_m: Metres
     northing_m: Metres
-    height_m: Metres
-
-    @staticmethod
-    def of(anchor: UtmAnchor) -> AnchorRecord:
-        """The record of an anchor."""
-        return AnchorRecord(
-            epsg=anchor.epsg,
-            easting_m=anchor.easting_m,
-            northing_m=anchor.northing_m,
-            height_m=anchor.height_m,
-        )
+    height_m: Annotated[int, Field(ge=-100_000, le=100_000)]
 
     def to_anchor(self) -> UtmAnchor:
         """The anchor of the record."""
@@ -101,13 +98,6 @@ class Sim3Record(_Model):
     scale: float = Field(gt=0.0)
     quat_xyzw: Annotated[tuple[float, float, float, float], AfterValidator(_unit_quaternion)]
     translation_m: tuple[float, float, float]
-
-    @staticmethod
-    def of(sim3: Sim3) -> Sim3Record:
-        """The record of a similarity."""
-        x, y, z, w = map(float, quat_xyzw_from_rotations(sim3.rotation))
-        tx, ty, tz = map(float, sim3.translation_m)
-        return Sim3Record(scale=float(sim3.scale), quat_xyzw=(x, y, z, w), translation_m=(tx, ty, tz))
 
     def to_sim3(self) -> Sim3:
         """The similarity of the record, equal to the original to about 1e-15."""
@@ -124,11 +114,6 @@ class CameraRecord(_Model):
     cx_px: float
     cy_px: float
     distortion: tuple[float, float, float, float, float]
-
-    @staticmethod
-    def of(camera: Camera) -> CameraRecord:
-        """The record of a camera."""
-        return CameraRecord(**{name: getattr(camera, name) for name in CameraRecord.model_fields})
 
     def to_camera(self) -> Camera:
         """The camera of the record."""
@@ -178,7 +163,7 @@ class Provenance(_Model):
     drive: str
     drive_sha256: Sha256 | None = None
     fleetmap_version: str
-    settings: dict[str, Any]
+    settings: Annotated[dict[str, Any], AfterValidator(_plain_json)]
     start_ns: Int64
     end_ns: Int64
     created_ns: Int64
@@ -270,7 +255,10 @@ def _check_format(document: object, origin: str) -> None:
     named = document.get("format") if isinstance(document, dict) else None
     if not isinstance(named, dict) or named.get("name") != FORMAT_NAME:
         raise MapPackageError(f"{origin} is not a fleetmap map: its manifest does not name '{FORMAT_NAME}'")
-    if named.get("major") != FORMAT_MAJOR:
+    major = named.get("major")
+    if not isinstance(major, int) or major < 1:
+        raise MapPackageError(f"manifest of {origin} does not hold at 'format.major': it must be a whole number")
+    if major != FORMAT_MAJOR:
         raise MapPackageError(
-            f"{origin} has map format {named.get('major')}, this fleetmap reads {FORMAT_MAJOR}; upgrade fleetmap"
+            f"{origin} has map format {str(major)[:20]}, this fleetmap reads {FORMAT_MAJOR}; upgrade fleetmap"
         )

@@ -9,28 +9,27 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.cells import decode_cell, encode_cell, merge_cells, split_into_cells
-from fleetmap.errors import MapPackageError, OutputExistsError
+from fleetmap.errors import MapPackageError, OutputExistsError, StorageError
 from fleetmap.files import atomic_path, refuse_existing
 from fleetmap.full_part import check_visual_map, decode_full, encode_full
 from fleetmap.geodesy import UtmGrid
+from fleetmap.geometry import Sim3, quat_xyzw_from_rotations
 from fleetmap.manifest import (
     MAX_MANIFEST_BYTES,
     MAX_PART_BYTES,
-    AnchorRecord,
-    CameraRecord,
     Manifest,
     PartRecord,
     Provenance,
     Quality,
-    Sim3Record,
     check_map_id,
     make_manifest,
     manifest_version,
@@ -142,10 +141,11 @@ def open_package(folder: Path) -> MapPackage:
     Raises:
         MapPackageError: no package there, or its manifest does not hold.
     """
-    if not folder.is_dir():
-        raise MapPackageError(f"there is no map package at {folder}; make one with 'fleetmap map'")
-    if not (folder / MANIFEST_NAME).exists():
-        raise MapPackageError(f"{folder} is no map package: it holds no {MANIFEST_NAME}")
+    with _reading(folder):
+        if not folder.is_dir():
+            raise MapPackageError(f"there is no map package at {folder}; make one with 'fleetmap map'")
+        if not (folder / MANIFEST_NAME).exists():
+            raise MapPackageError(f"{folder} is no map package: it holds no {MANIFEST_NAME}")
     manifest_bytes = _read_file(folder / MANIFEST_NAME, MAX_MANIFEST_BYTES)
     return MapPackage(folder, parse_manifest(manifest_bytes, str(folder)), manifest_bytes)
 
@@ -221,9 +221,9 @@ def _encode(
     manifest = make_manifest(
         {
             "map_id": map_id,
-            "anchor": AnchorRecord.of(visual_map.anchor),
-            "map_from_vis": Sim3Record.of(visual_map.map_from_vis),
-            "camera": CameraRecord.of(visual_map.camera),
+            "anchor": asdict(visual_map.anchor),
+            "map_from_vis": _sim3_fields(visual_map.map_from_vis),
+            "camera": asdict(visual_map.camera),
             "bbox_lonlat": _bounding_box(lonlat),
             "trajectory_lonlat": lonlat[_thin(keyframes.positions_m)].tolist(),
             "parts": records,
@@ -247,6 +247,14 @@ def _record(
         "cell": cell,
         "keyframes": keyframes,
         "landmarks": landmarks,
+    }
+
+
+def _sim3_fields(sim3: Sim3) -> dict[str, object]:
+    return {
+        "scale": float(sim3.scale),
+        "quat_xyzw": quat_xyzw_from_rotations(sim3.rotation).tolist(),
+        "translation_m": sim3.translation_m.tolist(),
     }
 
 
@@ -282,19 +290,29 @@ def _thin(positions_m: NDArray[np.float64]) -> list[int]:
 
 def _refuse_foreign(target: Path, force: bool) -> None:
     """``force`` replaces a map package or an empty folder, and never anything else of the user's."""
-    refuse_existing(target, force)
-    is_ours = target.is_dir() and ((target / MANIFEST_NAME).is_file() or not any(target.iterdir()))
-    if target.exists() and not is_ours:
+    try:
+        refuse_existing(target, force)
+        is_ours = target.is_dir() and ((target / MANIFEST_NAME).is_file() or not any(target.iterdir()))
+        is_foreign = target.exists() and not is_ours
+    except OSError as error:
+        raise StorageError(f"cannot write {target}: {error.strerror or error}") from error
+    if is_foreign:
         raise OutputExistsError(f"{target} is not a map package, --force will not replace it; give another name")
 
 
 def _read_file(path: Path, limit_bytes: int) -> bytes:
     """A file's bytes, at most one more than the limit: enough to tell that a file is too long."""
-    if not path.is_file():
-        raise MapPackageError(f"{path} is missing; {_AGAIN}")
-    try:
+    with _reading(path):
+        if not path.is_file():
+            raise MapPackageError(f"{path} is missing; {_AGAIN}")
         with path.open("rb") as file:
             return file.read(limit_bytes + 1)
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    try:
+        yield
     except OSError as error:
         raise MapPackageError(f"{path} cannot be read: {error.strerror or error}") from error
 

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import json
+import struct
+import zlib
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -37,6 +41,28 @@ def provenance() -> Provenance:
         end_ns=1_700_000_060_000_000_000,
         created_ns=1_700_000_100_000_000_000,
     )
+
+
+@pytest.fixture(scope="session")
+def explode() -> Callable[[bytes], tuple[dict[str, Any], bytes]]:
+    return explode_part
+
+
+@pytest.fixture(scope="session")
+def assemble() -> Callable[..., bytes]:
+    return assemble_part
+
+
+def explode_part(data: bytes) -> tuple[dict[str, Any], bytes]:
+    """Header and inflated payload of a part, taken apart without the code under test."""
+    length = struct.unpack_from("<I", data, 12)[0]
+    return json.loads(data[16 : 16 + length]), zlib.decompress(data[16 + length :])
+
+
+def assemble_part(header: Any, payload: bytes, *, major: int = 1, minor: int = 0) -> bytes:
+    """A part with whatever header and payload."""
+    text = json.dumps(header).encode()
+    return struct.pack("<8sHHI", b"FMPART\r\n", major, minor, len(text)) + text + zlib.compress(payload)
 
 
 def street_map(
