@@ -36,7 +36,7 @@ def match_descriptors(
     """
     if len(descriptors_a) == 0 or len(descriptors_b) == 0:
         return np.zeros((0, 2), dtype=np.int32)
-    pairs: IntArray = _match_all(_words(descriptors_a), _words(descriptors_b), max_distance, ratio, mutual)
+    pairs: IntArray = _match_all(as_words(descriptors_a), as_words(descriptors_b), max_distance, ratio, mutual)
     return pairs
 
 
@@ -72,10 +72,10 @@ def match_by_projection(
         np.ascontiguousarray(radii_px, dtype=np.float64),
         np.ascontiguousarray(octave_min, dtype=np.int32),
         np.ascontiguousarray(octave_max, dtype=np.int32),
-        _words(descriptors),
+        as_words(descriptors),
         np.ascontiguousarray(features.pixels),
         features.octaves.astype(np.int32),
-        _words(features.descriptors),
+        as_words(features.descriptors),
         origin,
         cells_across,
         cells_down,
@@ -113,10 +113,10 @@ def match_epipolar(
         return np.zeros((0, 2), dtype=np.int32)
     pairs: IntArray = _match_along_lines(
         np.ascontiguousarray(features_a.pixels),
-        _words(features_a.descriptors),
+        as_words(features_a.descriptors),
         np.flatnonzero(use_a),
         np.ascontiguousarray(features_b.pixels),
-        _words(features_b.descriptors),
+        as_words(features_b.descriptors),
         np.flatnonzero(use_b),
         features_b.sigmas_px,
         np.ascontiguousarray(fundamental_ba, dtype=np.float64),
@@ -143,20 +143,23 @@ def consistent_rotation(angles_a_deg: NDArray[np.float32], angles_b_deg: NDArray
 
 def medoid_descriptor(descriptors: Descriptors) -> int:
     """Index of the descriptor (K, 32) with the least median Hamming distance to the others."""
-    return int(_medoid(_words(descriptors)))
+    return int(_medoid(as_words(descriptors)))
 
 
 def hamming_distances(descriptors_a: Descriptors, descriptors_b: Descriptors) -> IntArray:
     """Bits (N,) int32 in which the rows of two (N, 32) arrays differ."""
-    return np.asarray(np.bitwise_count(_words(descriptors_a) ^ _words(descriptors_b)).sum(axis=1), dtype=np.int32)
+    return np.asarray(
+        np.bitwise_count(as_words(descriptors_a) ^ as_words(descriptors_b)).sum(axis=1), dtype=np.int32
+    )
 
 
-def _words(descriptors: Descriptors) -> NDArray[np.uint64]:
+def as_words(descriptors: Descriptors) -> NDArray[np.uint64]:
+    """Descriptors (N, 32) uint8 as (N, 4) uint64, for counting bits."""
     return np.ascontiguousarray(descriptors, dtype=np.uint8).view(np.uint64)
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _hamming(a, i, b, j):  # type: ignore[no-untyped-def]
+def hamming(a, i, b, j):  # type: ignore[no-untyped-def]
     """Bits that differ; the counting trick is recognised by LLVM and becomes one popcount per word."""
     total = np.uint64(0)
     for word in range(4):
@@ -169,6 +172,32 @@ def _hamming(a, i, b, j):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
+def nearest_words(words_a, words_b, count):  # type: ignore[no-untyped-def]
+    """The closest of ``words_b`` (M, 4) to each of ``words_a`` (N, 4), closest first: indices (N, count) int32.
+
+    Where b has fewer than ``count``, the last one again.
+    """
+    nearest = np.empty((len(words_a), count), np.int32)
+    distances = np.empty(count, np.int64)
+    for i in range(len(words_a)):
+        distances[:] = _NO_PAIR
+        found = 0
+        for j in range(len(words_b)):
+            distance = hamming(words_a, i, words_b, j)
+            if distance >= distances[count - 1]:
+                continue
+            slot = min(found, count - 1)
+            while slot > 0 and distances[slot - 1] > distance:
+                distances[slot], nearest[i, slot] = distances[slot - 1], nearest[i, slot - 1]
+                slot -= 1
+            distances[slot], nearest[i, slot] = distance, j
+            found = min(found + 1, count)
+        for slot in range(found, count):
+            nearest[i, slot] = nearest[i, found - 1]
+    return nearest
+
+
+@njit(cache=True, nogil=True)
 def _match_all(words_a, words_b, max_distance, ratio, mutual):  # type: ignore[no-untyped-def]
     count_a, count_b = len(words_a), len(words_b)
     best_of_b = np.full(count_b, _NO_PAIR, np.int64)
@@ -177,7 +206,7 @@ def _match_all(words_a, words_b, max_distance, ratio, mutual):  # type: ignore[n
     for i in range(count_a):
         best, second, chosen = _NO_PAIR, _NO_PAIR, -1
         for j in range(count_b):
-            distance = _hamming(words_a, i, words_b, j)
+            distance = hamming(words_a, i, words_b, j)
             if distance < best:
                 second, best, chosen = best, distance, j
             elif distance < second:
@@ -266,7 +295,7 @@ def _match_in_windows(  # type: ignore[no-untyped-def]
                 du, dv = feature_px[feature, 0] - u, feature_px[feature, 1] - v
                 if du * du + dv * dv > radius * radius:
                     continue
-                distance = _hamming(words, landmark, feature_words, feature)
+                distance = hamming(words, landmark, feature_words, feature)
                 if distance < best:
                     second, second_octave = best, best_octave
                     best, best_octave, best_feature = distance, octave, feature
@@ -315,7 +344,7 @@ def _match_along_lines(  # type: ignore[no-untyped-def]
             if abs(line_x * x_b[k] + line_y * y_b[k] + line_w) > reach_b[k]:
                 continue
             j = packed_b[k]
-            distance = _hamming(words_a, i, words_b, j)
+            distance = hamming(words_a, i, words_b, j)
             if distance < best:
                 best = distance
                 b_of_a[i] = j
@@ -331,7 +360,7 @@ def _medoid(words):  # type: ignore[no-untyped-def]
     distances = np.zeros((count, count), np.int64)
     for i in range(count):
         for j in range(i):
-            distances[i, j] = distances[j, i] = _hamming(words, i, words, j)
+            distances[i, j] = distances[j, i] = hamming(words, i, words, j)
     best, chosen = 1 << 20, 0
     for i in range(count):
         median = np.sort(distances[i])[count // 2]

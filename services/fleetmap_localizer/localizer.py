@@ -1,0 +1,209 @@
+"""From an image and a map to a UTM pose, or to none."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.camera import Camera
+from fleetmap.drive import Frame
+from fleetmap.geometry import Pose
+from fleetmap.vision.absolute_pose import (
+    AbsolutePose,
+    AbsolutePoseSettings,
+    estimate_absolute_pose,
+    refine_absolute_pose,
+)
+from fleetmap.vision.features import FeatureExtractor, Features
+from fleetmap.vision.matching import match_by_projection, match_descriptors
+from fleetmap.vision.place_recognition import PlaceIndex
+from fleetmap.visual_map import LocalizationMap
+from fleetmap_localizer.gate import is_trustworthy
+from fleetmap_localizer.local_map import Indices, LocalMap
+from fleetmap_localizer.motion import Motion
+from fleetmap_localizer.pose_estimate import PoseEstimate
+from fleetmap_localizer.settings import LocalizerSettings
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """A pose, the pixels (P, 2) it was fitted to, and how many landmarks should have been among them."""
+
+    answer: AbsolutePose
+    pixels: Array
+    landmarks_in_view: int
+
+
+class Localizer:
+    """Follows one camera through one map. The map is only looked at, never changed."""
+
+    def __init__(
+        self,
+        content: LocalizationMap,
+        map_camera: Camera,
+        camera: Camera,
+        settings: LocalizerSettings | None = None,
+    ) -> None:
+        """Prepare for images of ``camera``; ``map_camera`` is the one that drove the survey."""
+        self._settings = settings or LocalizerSettings()
+        self._content, self._camera = content, camera
+        self._extractor = FeatureExtractor(camera, self._settings.features)
+        self._places = PlaceIndex(
+            content.landmarks.descriptors,
+            content.seen_by_keyframe,
+            content.seen_landmark,
+            len(content.keyframes),
+            self._settings.place_index,
+        )
+        self._local_map = LocalMap(
+            content,
+            float(np.sqrt(map_camera.fx_px * map_camera.fy_px)),
+            camera,
+            self._settings.features.levels,
+            self._settings.features.scale_factor,
+            self._settings.local_map,
+        )
+        self._motion: Motion | None = None
+
+    def localize(self, frame: Frame) -> PoseEstimate | None:
+        """The camera's UTM pose at one image, or None where it cannot be told for sure.
+
+        Raises:
+            CalibrationError: the image does not have the calibrated size.
+        """
+        return self.localize_features(self._extractor.extract(frame.image), frame.stamp_ns)
+
+    def localize_features(self, features: Features, stamp_ns: int) -> PoseEstimate | None:
+        """The same for an image whose features are known already, as when several maps are asked."""
+        answer = self._track(features, stamp_ns)
+        if answer is None:
+            answer = self._relocalize(features, stamp_ns)
+        self._remember(stamp_ns, answer)
+        if answer is None:
+            return None
+        return PoseEstimate(
+            stamp_ns=stamp_ns,
+            utm_from_cam=Pose(
+                answer.map_from_cam.rotation, self._content.anchor.utm_from_map(answer.map_from_cam.translation_m)
+            ),
+            covariance=answer.covariance,
+            inlier_count=answer.inlier_count,
+        )
+
+    def _track(self, features: Features, stamp_ns: int) -> AbsolutePose | None:
+        """Search around where the vehicle should be by now."""
+        settings = self._settings.tracking
+        motion = self._recent_motion(stamp_ns)
+        if motion is None:
+            return None
+        predicted = motion.predict(stamp_ns)
+        for radii_px in settings.radii_px:
+            answer = self._fit(features, predicted, radii_px, self._settings.gate.min_inliers_tracking)
+            if answer is not None and motion.can_reach(stamp_ns, answer.map_from_cam, settings):
+                return answer
+        return None
+
+    def _relocalize(self, features: Features, stamp_ns: int) -> AbsolutePose | None:
+        """Search from nothing: like places, landmarks matched by descriptor alone, then by projection."""
+        settings = self._settings.relocalization
+        motion = self._recent_motion(stamp_ns)
+        for landmarks in self._candidate_places(features):
+            initial = self._pose_among(features, landmarks)
+            if initial is None:
+                continue
+            answer = self._fit(
+                features, initial, settings.radii_px, self._settings.gate.min_inliers_relocalization
+            )
+            if answer is None:
+                continue
+            if motion is None or motion.can_reach(stamp_ns, answer.map_from_cam, self._settings.tracking):
+                return answer
+        return None
+
+    def _candidate_places(self, features: Features) -> list[Indices]:
+        """Landmarks of the likeliest places, best first; no keyframe stands for two of them."""
+        settings = self._settings.relocalization
+        scores = self._places.scores(features.descriptors)
+        places: list[Indices] = []
+        while len(places) < settings.candidates and scores.max(initial=0.0) > 0.0:
+            best = int(np.argmax(scores))
+            neighbours = self._local_map.covisible(best, settings.min_shared_landmarks, settings.neighbours)
+            group = np.append(neighbours, best)
+            places.append(self._local_map.landmarks_of(group))
+            scores[group] = 0.0
+        return places
+
+    def _pose_among(self, features: Features, landmarks: Indices) -> Pose | None:
+        """The pose that the matches with these landmarks agree on, by RANSAC."""
+        settings = self._settings.relocalization
+        group = self._content.landmarks
+        pairs = match_descriptors(
+            features.descriptors, group.descriptors[landmarks], settings.max_distance, settings.ratio
+        )
+        if len(pairs) < settings.min_matches:
+            return None
+        seen, matched = pairs[:, 0], landmarks[pairs[:, 1]]
+        answer = estimate_absolute_pose(
+            features.pixels[seen],
+            group.points_m[matched],
+            features.sigmas_px[seen],
+            self._camera,
+            AbsolutePoseSettings(settings.min_ransac_inliers, settings.ransac_error_px),
+        )
+        return None if answer is None else answer.map_from_cam
+
+    def _fit(
+        self, features: Features, guess: Pose, radii_px: tuple[float, ...], min_inliers: int
+    ) -> AbsolutePose | None:
+        """Match landmarks around a guess by projection and refine, in ever smaller windows; gate the result."""
+        around = self._local_map.landmarks_around(guess)
+        fit = None
+        for radius_px in radii_px:
+            fit = self._fit_once(features, guess, around, radius_px)
+            if fit is None:
+                return None
+            guess = fit.answer.map_from_cam
+        if fit is None or not is_trustworthy(
+            fit.answer, fit.pixels, fit.landmarks_in_view, min_inliers, self._camera, self._settings.gate
+        ):
+            return None
+        return fit.answer
+
+    def _fit_once(self, features: Features, guess: Pose, around: Indices, radius_px: float) -> _Fit | None:
+        settings = self._settings.tracking
+        group = self._content.landmarks
+        predictions = self._local_map.predict(around, guess)
+        found = match_by_projection(
+            predictions.pixels,
+            np.asarray(radius_px * features.scale_factor**predictions.octaves, dtype=np.float64),
+            predictions.octaves - 1,
+            predictions.octaves + 1,
+            group.descriptors[predictions.landmarks],
+            features,
+            settings.max_distance,
+            settings.ratio,
+        )
+        seen, landmarks = found[found >= 0], predictions.landmarks[found >= 0]
+        pixels = features.pixels[seen]
+        answer = refine_absolute_pose(
+            pixels, group.points_m[landmarks], features.sigmas_px[seen], self._camera, guess
+        )
+        return None if answer is None else _Fit(answer, pixels, len(predictions.landmarks))
+
+    def _recent_motion(self, stamp_ns: int) -> Motion | None:
+        """The track so far, unless it ended too long ago, or time has not gone on."""
+        if self._motion is None:
+            return None
+        elapsed_s = (stamp_ns - self._motion.stamp_ns) * 1e-9
+        return self._motion if 0.0 < elapsed_s <= self._settings.tracking.max_gap_s else None
+
+    def _remember(self, stamp_ns: int, answer: AbsolutePose | None) -> None:
+        if answer is None:
+            return
+        motion = self._recent_motion(stamp_ns)
+        pose = answer.map_from_cam
+        self._motion = Motion(stamp_ns, pose) if motion is None else motion.follow(stamp_ns, pose)

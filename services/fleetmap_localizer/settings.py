@@ -1,0 +1,70 @@
+"""What the localizer may be tuned by, one group per stage. Lengths in pixels refer to the finest octave."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from fleetmap.vision.features import FeatureSettings
+from fleetmap.vision.place_recognition import PlaceIndexSettings
+
+
+@dataclass(frozen=True)
+class LocalMapSettings:
+    """Which landmarks are looked for around a predicted pose."""
+
+    keyframes: int = 24  # nearest to the pose
+    turn_weight_m: float = 6.0  # a keyframe turned by a radian counts as so much further away
+    max_viewing_angle_deg: float = 70.0  # between the ray to a landmark and the rays it was mapped from
+
+
+@dataclass(frozen=True)
+class RelocalizationSettings:
+    """The search from nothing."""
+
+    candidates: int = 5  # places tried
+    neighbours: int = 8  # covisible keyframes that join a candidate
+    min_shared_landmarks: int = 15  # to call two keyframes covisible
+    max_distance: int = 64  # Hamming bits
+    ratio: float = 0.85
+    min_matches: int = 15
+    min_ransac_inliers: int = 10
+    ransac_error_px: float = 6.0
+    radii_px: tuple[float, ...] = (12.0, 5.0)  # windows around the projections, round after round
+
+
+@dataclass(frozen=True)
+class TrackingSettings:
+    """The search around a prediction."""
+
+    max_gap_s: float = 1.0  # without a pose for longer, the place is searched for from nothing
+    max_distance: int = 64  # Hamming bits
+    ratio: float = 0.9
+    radii_px: tuple[tuple[float, ...], ...] = ((15.0, 5.0), (40.0, 12.0, 5.0))  # the second if the first fails
+    max_acceleration_mps2: float = 15.0  # a pose that the vehicle cannot have reached is not believed
+    max_speed_mps: float = 80.0
+    slack_m: float = 0.5
+
+
+@dataclass(frozen=True)
+class GateSettings:
+    """What a pose must show before it is reported: no pose is better than a wrong one."""
+
+    min_inliers_tracking: int = 20
+    min_inliers_relocalization: int = 30
+    min_inlier_ratio: float = 0.5  # inliers per matched landmark
+    min_seen_ratio: float = 0.06  # inliers per landmark that should be in view
+    min_occupied_cells: int = 8  # of a grid of 8 x 4 over the image
+    max_position_sigma_m: float = 0.5
+    max_rotation_sigma_deg: float = 1.0
+
+
+@dataclass(frozen=True)
+class LocalizerSettings:
+    """All groups together."""
+
+    features: FeatureSettings = field(default_factory=FeatureSettings)
+    place_index: PlaceIndexSettings = field(default_factory=PlaceIndexSettings)
+    local_map: LocalMapSettings = field(default_factory=LocalMapSettings)
+    relocalization: RelocalizationSettings = field(default_factory=RelocalizationSettings)
+    tracking: TrackingSettings = field(default_factory=TrackingSettings)
+    gate: GateSettings = field(default_factory=GateSettings)
