@@ -1,0 +1,73 @@
+"""What stands in a street: parked cars, trees, lamps, signs, bins."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.simulation import textures
+from fleetmap.simulation.path import StreetPath
+from fleetmap.simulation.surfaces import SurfaceBuilder
+from fleetmap.simulation.vehicles import paint_car, park_car
+
+Array = NDArray[np.float64]
+Rng = np.random.Generator
+
+
+def park_cars(rng: Rng, builder: SurfaceBuilder, path: StreetPath, left_m: float, span: Array) -> None:
+    """Cars along one kerb, some places free."""
+    paints = [paint_car(rng, builder) for _ in range(5)]
+    for slot in np.arange(span[0], span[1], 5.9):
+        if rng.random() < 0.45:
+            continue
+        s = slot + float(rng.uniform(-0.3, 0.3))
+        near, far = path.at(np.array([s - 1.5, s + 1.5]), left_m + float(rng.normal(0.0, 0.06)))
+        forward = (far - near) / np.linalg.norm(far - near) * float(rng.choice([-1.0, 1.0]))
+        left = np.cross([0.0, 0.0, 1.0], forward)
+        left /= np.linalg.norm(left)
+        axes = np.column_stack([forward, left, np.cross(forward, left)])
+        paint = paints[int(rng.integers(len(paints)))]
+        park_car(builder, paint, axes, (near + far) / 2.0, float(rng.uniform(0.92, 1.08)))
+
+
+def plant_trees(rng: Rng, builder: SurfaceBuilder, path: StreetPath, left_m: float, span: Array) -> None:
+    """A row of trees: trunks, and crowns of crossing leafy sheets."""
+    leaves = []
+    for _ in range(6):
+        grey = textures.paint_foliage(rng, 4.8, 4.8)
+        leaves.append(builder.add_texture(grey, textures.cut_crown(rng, grey)))
+    bark = builder.add_texture(textures.paint_plain(rng, 0.4, 2.6, 70.0, 16.0))
+    s = float(span[0])
+    while s < span[1]:
+        foot = path.at(s, left_m + float(rng.normal(0.0, 0.1)))
+        height, size = float(rng.uniform(1.8, 2.8)), float(rng.uniform(2.6, 5.2))
+        builder.add_box(foot, float(rng.uniform(0.0, np.pi)), (0.34, 0.34, height + 0.3 * size), bark)
+        for direction in float(rng.uniform(0.0, np.pi)) + np.arange(3) * np.pi / 3.0:
+            aside = 0.5 * size * np.array([np.cos(direction), np.sin(direction), 0.0])
+            low = foot + [0.0, 0.0, height - 0.1 * size]
+            high = low + [0.0, 0.0, size * float(rng.uniform(0.9, 1.2))]
+            sheet = np.stack([high - aside, high + aside, low + aside, low - aside])
+            builder.add_quad(
+                sheet, int(rng.choice(leaves)), two_sided=True, lit=False, shade=float(rng.uniform(0.75, 1.1))
+            )
+        s += float(rng.uniform(8.0, 19.0))
+
+
+def place_furniture(rng: Rng, builder: SurfaceBuilder, path: StreetPath, left_m: float, span: Array) -> None:
+    """Lamp posts, traffic signs and junction boxes along one kerb."""
+    metal = builder.add_texture(textures.paint_plain(rng, 0.2, 6.0, 130.0, 14.0))
+    signs = [builder.add_texture(textures.paint_sign(rng, 0.7, 0.7)) for _ in range(5)]
+    boxes = [builder.add_texture(textures.paint_sign(rng, 1.1, 1.1)) for _ in range(4)]
+    for s in np.arange(span[0] + 4.0, span[1], 9.0):
+        where = s + float(rng.uniform(-2.5, 2.5))
+        foot, heading = path.at(where, left_m), float(path.heading_rad(where))
+        kind = rng.random()
+        if kind < 0.35:
+            builder.add_box(foot, heading, (0.14, 0.14, 6.2), metal)
+            builder.add_box(foot + [0.0, 0.0, 6.2], heading, (0.9, 0.3, 0.15), metal)
+        elif kind < 0.7:
+            builder.add_box(foot, heading, (0.07, 0.07, 3.0), metal)
+            builder.add_box(foot + [0.0, 0.0, 2.2], heading, (0.03, 0.7, 0.7), int(rng.choice(signs)))
+        else:
+            size = (float(rng.uniform(0.5, 1.1)), float(rng.uniform(0.4, 0.6)), float(rng.uniform(0.8, 1.3)))
+            builder.add_box(foot, heading, size, int(rng.choice(boxes)))

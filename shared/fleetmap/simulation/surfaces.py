@@ -1,0 +1,131 @@
+"""What a simulated world is made of: flat four-cornered surfaces, each with a grey texture.
+
+A texture is stretched over its surface projectively: its outer corners lie on the surface's corners, texel
+centres half a texel inside. Everything that has a place in the world (ground, walls, cars, leaves) is a surface,
+so whatever sees the world (a camera now, a range sensor another day) needs to know nothing else.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+GreyImage = NDArray[np.uint8]
+
+_PLANARITY_M = 1e-4
+
+
+@dataclass(frozen=True)
+class Texture:
+    """A grey picture, sides a multiple of 64, and where it is opaque (None: everywhere)."""
+
+    grey: GreyImage  # (H, W) uint8
+    opacity: GreyImage | None = None  # (H, W) uint8: 255 opaque, 0 see-through
+
+
+@dataclass(frozen=True)
+class Surfaces:
+    """Surfaces as a struct of arrays, in the map frame. Corners: top left, top right, bottom right, bottom left."""
+
+    corners_in_map: Array  # (Q, 4, 3) float64
+    texture_indices: NDArray[np.int64]  # (Q,) int64
+    brightness: Array  # (Q,) float64, factor on the texture's grey: how the light falls
+    two_sided: NDArray[np.bool_]  # (Q,) bool; the others are seen only from where the corners run clockwise
+
+    def __len__(self) -> int:
+        return len(self.texture_indices)
+
+    @cached_property
+    def map_from_texture(self) -> Array:
+        """(Q, 3, 3): takes homogeneous texture coordinates (s, t, 1), each in [0, 1], to map points times a weight.
+
+        The third row of :attr:`weights` times (s, t, 1) is that weight. From the corner correspondences; the
+        general case is in P. Heckbert, "Fundamentals of Texture Mapping and Image Warping", 1989, section 2.2.3.
+        """
+        top_left, right_axis, down_axis = self._axes()
+        basis = np.stack([right_axis, down_axis, top_left], axis=2)
+        return np.asarray(basis @ self.weights)
+
+    @cached_property
+    def weights(self) -> Array:
+        """(Q, 3, 3): takes (s, t, 1) to homogeneous coordinates along the top and left edge."""
+        top_left, right_axis, down_axis = self._axes()
+        axes = np.stack([right_axis, down_axis], axis=2)
+        diagonal = (self.corners_in_map[:, 2] - top_left)[:, :, None]
+        along = (np.linalg.pinv(axes) @ diagonal)[:, :, 0]
+        along = along / (along.sum(axis=1, keepdims=True) - 1.0)
+        weights = np.zeros((len(self), 3, 3))
+        weights[:, 0, 0], weights[:, 1, 1], weights[:, 2, 2] = along[:, 0], along[:, 1], 1.0
+        weights[:, 2, 0], weights[:, 2, 1] = along[:, 0] - 1.0, along[:, 1] - 1.0
+        return weights
+
+    def _axes(self) -> tuple[Array, Array, Array]:
+        top_left = self.corners_in_map[:, 0]
+        return top_left, self.corners_in_map[:, 1] - top_left, self.corners_in_map[:, 3] - top_left
+
+
+@dataclass
+class SurfaceBuilder:
+    """Collects textures and surfaces while a world is laid out."""
+
+    sun_in_map: Array  # (3,) float64, unit vector towards the sun
+    textures: list[Texture] = field(default_factory=list)
+    _corners: list[Array] = field(default_factory=list)
+    _texture_indices: list[int] = field(default_factory=list)
+    _brightness: list[float] = field(default_factory=list)
+    _two_sided: list[bool] = field(default_factory=list)
+
+    def add_texture(self, grey: GreyImage, opacity: GreyImage | None = None) -> int:
+        """Keep a texture; the number returned names it."""
+        if grey.shape[0] % 64 or grey.shape[1] % 64:
+            raise ValueError(f"texture sides must be multiples of 64, got {grey.shape}")
+        self.textures.append(Texture(grey, opacity))
+        return len(self.textures) - 1
+
+    def add_quad(
+        self, corners_in_map: Array, texture: int, *, two_sided: bool = False, lit: bool = True, shade: float = 1.0
+    ) -> None:
+        """Add a flat surface; corners (4, 3) top left, top right, bottom right, bottom left as seen from its front."""
+        corners = np.asarray(corners_in_map, dtype=np.float64)
+        normal = np.cross(corners[3] - corners[0], corners[1] - corners[0])
+        normal /= np.linalg.norm(normal)
+        if abs(float((corners[2] - corners[0]) @ normal)) > _PLANARITY_M:
+            raise ValueError(f"the four corners of a surface do not lie in one plane: {corners.tolist()}")
+        sun = float(normal @ self.sun_in_map)
+        brightness = shade * (0.5 + 0.55 * max(abs(sun) if two_sided else sun, 0.0)) if lit else shade
+        self._corners.append(corners)
+        self._texture_indices.append(texture)
+        self._brightness.append(brightness)
+        self._two_sided.append(two_sided)
+
+    def add_prism(
+        self, bottom: Array, top: Array, sides: tuple[int, int, int, int], lid: int, *, shade: float = 1.0
+    ) -> None:
+        """Add four walls and a lid between two rings of corners (4, 3), both clockwise seen from above.
+
+        Wall i stands on bottom[i], bottom[i + 1] and is painted with ``sides[i]``. Each ring lies level.
+        """
+        for i, side in enumerate(sides):
+            j = (i + 1) % 4
+            self.add_quad(np.stack([top[j], top[i], bottom[i], bottom[j]]), side, shade=shade)
+        self.add_quad(top, lid, shade=shade)
+
+    def add_box(self, foot: Array, heading_rad: float, size_m: tuple[float, float, float], texture: int) -> None:
+        """Add a box standing on the middle of its base; its size is along its heading, across, and up."""
+        along = 0.5 * size_m[0] * np.array([np.cos(heading_rad), np.sin(heading_rad), 0.0])
+        left = 0.5 * size_m[1] * np.array([-np.sin(heading_rad), np.cos(heading_rad), 0.0])
+        base = foot + np.stack([along + left, along - left, -along - left, left - along])
+        self.add_prism(base, base + [0.0, 0.0, size_m[2]], (texture, texture, texture, texture), texture)
+
+    def surfaces(self) -> Surfaces:
+        """All surfaces added so far."""
+        return Surfaces(
+            np.stack(self._corners),
+            np.array(self._texture_indices, dtype=np.int64),
+            np.array(self._brightness),
+            np.array(self._two_sided),
+        )
