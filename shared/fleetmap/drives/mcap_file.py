@@ -50,13 +50,9 @@ class McapFile:
             DriveError: not there, empty, not an MCAP, truncated, or damaged.
         """
         self.path = path
-        try:
-            with path.open("rb") as file:
-                _check_both_ends(path, file)
-                file.seek(0)
-                self._is_indexed, topics = self._read_summary(file)
-        except OSError as error:
-            raise DriveError(f"cannot read recording {path}: {error.strerror or error}") from error
+        with _opened(path) as file:
+            _check_both_ends(path, file)
+            self._is_indexed, topics = self._read_summary(file)
         self.topics = topics if topics is not None else self._scan_topics()
 
     def messages(self, *topics: str) -> Iterator[RawMessage]:
@@ -71,19 +67,14 @@ class McapFile:
     def _read_summary(self, file: IO[bytes]) -> tuple[bool, dict[str, Topic] | None]:
         """Whether chunks can be found by an index, and the topics if the summary counts their messages."""
         try:
-            reader = SeekingReader(file, record_size_limit=_RECORD_SIZE_LIMIT)
-            if reader.get_header().profile not in ("ros2", ""):
-                profile = reader.get_header().profile
-                raise DriveError(f"{self.path} was recorded for '{profile}'; fleetmap reads ROS 2 recordings")
-            summary = reader.get_summary()
-        except DriveError:
-            raise
+            summary = SeekingReader(file, record_size_limit=_RECORD_SIZE_LIMIT).get_summary()
         except Exception as error:  # a parser fed with foreign bytes
             raise _damaged(self.path, error) from error
         if summary is None or not summary.channels:
             return False, None
-        is_indexed = bool(summary.chunk_indexes)
-        return is_indexed, _topics_of(summary) if summary.statistics else None
+        names_all_schemas = all(c.schema_id in summary.schemas for c in summary.channels.values() if c.schema_id)
+        is_indexed = bool(summary.chunk_indexes) and names_all_schemas
+        return is_indexed, _topics_of(summary) if summary.statistics and names_all_schemas else None
 
     def _scan_topics(self) -> dict[str, Topic]:
         """Topics and counts of a file that ends without them: one pass over all messages."""
@@ -94,7 +85,7 @@ class McapFile:
         return topics
 
     def _stream(self, topics: tuple[str, ...] | None) -> Iterator[_McapMessage]:
-        with self.path.open("rb") as file:
+        with _opened(self.path) as file:
             reader: SeekingReader | NonSeekingReader
             if self._is_indexed:
                 reader = SeekingReader(file, validate_crcs=True, record_size_limit=_RECORD_SIZE_LIMIT)
@@ -111,6 +102,13 @@ class McapFile:
                 yield message
 
 
+def _opened(path: Path) -> IO[bytes]:
+    try:
+        return path.open("rb")
+    except OSError as error:
+        raise DriveError(f"cannot read recording {path}: {error.strerror or error}") from error
+
+
 def _check_both_ends(path: Path, file: IO[bytes]) -> None:
     start = file.read(len(_MAGIC))
     if not start:
@@ -124,6 +122,7 @@ def _check_both_ends(path: Path, file: IO[bytes]) -> None:
             f"recording {path} is truncated (it does not end like an MCAP file); copy it again,"
             " or repair it with 'mcap recover'"
         )
+    file.seek(0)
 
 
 def _topics_of(summary: Summary) -> dict[str, Topic]:

@@ -17,6 +17,8 @@ CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 NAV_SAT_FIX = "sensor_msgs/msg/NavSatFix"
 TF_MESSAGE = "tf2_msgs/msg/TFMessage"
 
+_IDL_RULER = "=" * 80 + "\n"
+
 
 class MessageDecoder:
     """Decodes the messages of one topic by the definition that the recording itself holds."""
@@ -74,10 +76,18 @@ def _typestore_of(topic: Topic) -> Typestore:
     typestore = get_typestore(Stores.EMPTY)
     try:
         if topic.schema_encoding == "ros2idl":
-            typestore.register(get_types_from_idl(topic.schema_text))
+            for document in _idl_documents(topic.schema_text):
+                typestore.register(get_types_from_idl(document))
         else:
             typestore.register(get_types_from_msg(topic.schema_text, topic.message_type))
         typestore.get_msgdef(topic.message_type)
     except Exception as error:  # a parser fed with foreign text
         raise DriveError(f"the message definition of {topic.name} cannot be understood: {error}") from error
     return typestore
+
+
+def _idl_documents(bundle: str) -> list[str]:
+    """rosbag2 bundles IDL files, each under a ruler and a line ``IDL: package/msg/Name``."""
+    if not bundle.startswith(_IDL_RULER):
+        return [bundle]
+    return [part.partition("\n")[2] for part in bundle.split(_IDL_RULER)[1:]]

@@ -15,6 +15,7 @@ from fleetmap.geometry import Array, Pose, rotations_from_quat_xyzw
 UNKNOWN_COVARIANCE_SIGMA_M = 1.5  # a fix that does not say how good it is counts as a consumer receiver's
 _NO_FIX, _COVARIANCE_UNKNOWN = -1, 0
 _PLUMB_BOB_LIKE = ("plumb_bob", "rational_polynomial", "")
+_NEVER_PINHOLE = ("equidistant", "fisheye")  # these bend the image also with all coefficients zero
 
 
 def camera_from_camera_info(info: Any, info_topic: str, *, rectified: bool) -> Camera:
@@ -29,7 +30,8 @@ def camera_from_camera_info(info: Any, info_topic: str, *, rectified: bool) -> C
         return _camera(info_topic, width, height, P[:, :3], ())
     model = str(info.distortion_model)
     coefficients = tuple(float(value) for value in info.d)
-    if any(coefficients) and (model not in _PLUMB_BOB_LIKE or len(coefficients) < 4 or any(coefficients[5:])):
+    is_plumb_bob = model in _PLUMB_BOB_LIKE and len(coefficients) >= 4 and not any(coefficients[5:])
+    if model in _NEVER_PINHOLE or (any(coefficients) and not is_plumb_bob):
         raise CalibrationError(
             f"{info_topic} has distortion model '{model}' with {len(coefficients)} coefficients;"
             " fleetmap reads plumb_bob (k1, k2, p1, p2, k3): calibrate with it, or record rectified images"

@@ -1,0 +1,221 @@
+"""Recordings as other tools write them, built without the project's own writer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, Self
+
+import cv2
+import numpy as np
+import pytest
+from mcap.writer import CompressionType, IndexType, Writer
+from rosbags.rosbag2 import Writer as Rosbag2Writer
+from rosbags.rosbag2.enums import StoragePlugin
+from rosbags.typesys import Stores, get_typestore
+
+from fleetmap.camera import Camera
+
+TYPES = get_typestore(Stores.ROS2_JAZZY)
+T0_NS = 1_650_000_000_123_456_789
+FRAME_NS = 100_000_000
+
+
+class ForeignRecorder:
+    """Writes ROS 2 messages as other tools do; log times are the stamps unless given."""
+
+    def __init__(self, path: Path, *, rosbag2: bool = False, schema_text: bool = True, **options: Any) -> None:
+        self.path, self._rosbag2, self._schema_text, self._options = path, rosbag2, schema_text, options
+        self._channels: dict[str, Any] = {}
+        self._stack = ExitStack()
+
+    def __enter__(self) -> Self:
+        if self._rosbag2:
+            self._bag = self._stack.enter_context(
+                Rosbag2Writer(self.path, version=9, storage_plugin=StoragePlugin.MCAP)
+            )
+        else:
+            file = self._stack.enter_context(self.path.open("wb"))
+            self._mcap = Writer(file, **{"chunk_size": 20_000, **self._options})
+            self._mcap.start(profile="ros2", library="some other tool")
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if not self._rosbag2:
+            self._mcap.finish()
+        self._stack.close()
+
+    def write(self, topic: str, message: Any, stamp_ns: int, *, encoding: str = "cdr", data: bytes = b"") -> None:
+        data = data or bytes(TYPES.serialize_cdr(message, message.__msgtype__))
+        if self._rosbag2:
+            if topic not in self._channels:
+                self._channels[topic] = self._bag.add_connection(topic, message.__msgtype__, typestore=TYPES)
+            self._bag.write(self._channels[topic], stamp_ns, data)
+            return
+        if topic not in self._channels:
+            text = TYPES.generate_msgdef(message.__msgtype__, ros_version=2)[0] if self._schema_text else ""
+            schema_id = self._mcap.register_schema(message.__msgtype__, "ros2msg", text.encode())
+            self._channels[topic] = self._mcap.register_channel(topic, encoding, schema_id)
+        self._mcap.add_message(self._channels[topic], stamp_ns, data, stamp_ns)
+
+    def jpeg(self, topic: str, stamp_ns: int, image: np.ndarray, frame_id: str, **write: Any) -> None:
+        self.compressed(topic, stamp_ns, cv2.imencode(".jpg", image)[1].tobytes(), "jpeg", frame_id, **write)
+
+    def compressed(
+        self, topic: str, stamp_ns: int, data: bytes, image_format: str, frame_id: str, log_ns: int | None = None
+    ) -> None:
+        message = TYPES.types["sensor_msgs/msg/CompressedImage"](
+            header(stamp_ns, frame_id), image_format, np.frombuffer(data, np.uint8)
+        )
+        self.write(topic, message, stamp_ns if log_ns is None else log_ns)
+
+    def raw_image(
+        self, topic: str, stamp_ns: int, data: np.ndarray, encoding: str, frame_id: str, width: int, step: int
+    ) -> None:
+        message = TYPES.types["sensor_msgs/msg/Image"](
+            header(stamp_ns, frame_id), data.size // step, width, encoding, 0, step, data.reshape(-1)
+        )
+        self.write(topic, message, stamp_ns)
+
+    def camera_info(
+        self,
+        topic: str,
+        stamp_ns: int,
+        camera: Camera,
+        frame_id: str,
+        *,
+        model: str = "plumb_bob",
+        d: tuple[float, ...] | None = None,
+        k: np.ndarray | None = None,
+        p: np.ndarray | None = None,
+    ) -> None:
+        region = TYPES.types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
+        k = camera.matrix if k is None else k
+        message = TYPES.types["sensor_msgs/msg/CameraInfo"](
+            header(stamp_ns, frame_id),
+            camera.height_px,
+            camera.width_px,
+            model,
+            np.array(camera.distortion if d is None else d, dtype=np.float64),
+            k.reshape(9),
+            np.eye(3).reshape(9),
+            (np.hstack([k, np.zeros((3, 1))]) if p is None else p).reshape(12),
+            0,
+            0,
+            region,
+        )
+        self.write(topic, message, stamp_ns)
+
+    def fix(
+        self,
+        topic: str,
+        stamp_ns: int,
+        position: tuple[float, float, float],
+        frame_id: str,
+        *,
+        status: int = 0,
+        covariance: np.ndarray | None = None,
+        covariance_type: int = 3,
+    ) -> None:
+        covariance = np.eye(3) * 0.04 if covariance is None else covariance
+        message = TYPES.types["sensor_msgs/msg/NavSatFix"](
+            header(stamp_ns, frame_id),
+            TYPES.types["sensor_msgs/msg/NavSatStatus"](status, 1),
+            *position,
+            covariance.astype(np.float64).reshape(9),
+            covariance_type,
+        )
+        self.write(topic, message, stamp_ns)
+
+    def transforms(
+        self,
+        stamp_ns: int,
+        *links: tuple[str, str, tuple[float, float, float], tuple[float, float, float, float]],
+        topic: str = "/tf_static",
+    ) -> None:
+        geometry = "geometry_msgs/msg/"
+        stamped = [
+            TYPES.types[geometry + "TransformStamped"](
+                header(stamp_ns, parent),
+                child,
+                TYPES.types[geometry + "Transform"](
+                    TYPES.types[geometry + "Vector3"](*translation),
+                    TYPES.types[geometry + "Quaternion"](*quat_xyzw),
+                ),
+            )
+            for parent, child, translation, quat_xyzw in links
+        ]
+        self.write(topic, TYPES.types["tf2_msgs/msg/TFMessage"](stamped), stamp_ns)
+
+
+def header(stamp_ns: int, frame_id: str) -> Any:
+    time = TYPES.types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, 1_000_000_000))
+    return TYPES.types["std_msgs/msg/Header"](time, frame_id)
+
+
+@pytest.fixture
+def record(tmp_path: Path) -> Callable[..., ForeignRecorder]:
+    """``with record("name.mcap", compression=...) as recorder: recorder.jpeg(...)``."""
+
+    def build(name: str = "foreign.mcap", **options: Any) -> ForeignRecorder:
+        return ForeignRecorder(tmp_path / name, **options)
+
+    return build
+
+
+@pytest.fixture(scope="session")
+def small_camera() -> Camera:
+    return Camera(64, 48, 50.0, 51.0, 31.5, 23.5, (-0.3, 0.1, 0.001, -0.002, 0.01))
+
+
+@pytest.fixture(scope="session")
+def pictures() -> list[np.ndarray]:
+    """Ten smooth, different grey images of 64x48 that survive JPEG."""
+    x, y = np.meshgrid(np.arange(64), np.arange(48))
+    return [(127 + 100 * np.sin(x / 9.0 + k) * np.cos(y / 7.0)).astype(np.uint8) for k in range(10)]
+
+
+@pytest.fixture
+def street(record: Callable[..., ForeignRecorder], small_camera: Camera, pictures: list[np.ndarray]) -> Any:
+    """Write a complete small recording with any options of ForeignRecorder; returns its path."""
+
+    def build(name: str = "foreign.mcap", gnss_frame_id: str = "gnss", **options: Any) -> Path:
+        with record(name, **options) as recorder:
+            recorder.transforms(T0_NS, ("cam", "gnss", (0.1, -1.5, -0.4), (0.0, 0.0, 0.0, 1.0)))
+            for index, picture in enumerate(pictures):
+                stamp_ns = T0_NS + index * FRAME_NS
+                recorder.camera_info("/front/camera_info", stamp_ns, small_camera, "cam")
+                recorder.jpeg("/front/image/compressed", stamp_ns, picture, "cam")
+                position = (49.0 + 1e-6 * index, 8.4, 120.0)
+                recorder.fix("/gps/fix", stamp_ns + FRAME_NS // 3, position, gnss_frame_id)
+        return Path(recorder.path)
+
+    return build
+
+
+ALL_BUT_INDEX = {
+    "no chunks": {"use_chunking": False},
+    "no index": {"index_types": IndexType.NONE},
+    "no statistics": {"use_statistics": False},
+    "no repeated channels": {"repeat_channels": False, "repeat_schemas": False, "use_statistics": False},
+    "no repeated schemas": {"repeat_schemas": False},
+    "no summary": {
+        "index_types": IndexType.NONE,
+        "repeat_channels": False,
+        "repeat_schemas": False,
+        "use_statistics": False,
+        "use_summary_offsets": False,
+    },
+    "lz4": {"compression": CompressionType.LZ4},
+    "zstd": {"compression": CompressionType.ZSTD},
+    "uncompressed": {"compression": CompressionType.NONE},
+    "without message definitions": {"schema_text": False},
+}
+
+
+@pytest.fixture(params=ALL_BUT_INDEX.values(), ids=ALL_BUT_INDEX.keys())
+def kind_of_file(request: pytest.FixtureRequest) -> dict[str, Any]:
+    """The kinds of MCAP that the format allows."""
+    options: dict[str, Any] = request.param
+    return options
