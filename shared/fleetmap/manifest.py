@@ -41,6 +41,7 @@ Sha256 = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
 PartKind = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]{0,31}$")]
 MapId = Annotated[str, StringConstraints(pattern=MAP_ID_PATTERN)]
 Int64 = Annotated[int, Field(ge=-(2**63), le=2**63 - 1)]
+Total = Annotated[int, Field(ge=0, le=2**63 - 1)]
 Metres = Annotated[int, Field(ge=-100_000_000, le=100_000_000)]
 CellNumber = Annotated[int, Field(ge=-1_000_000, le=1_000_000)]
 LonDeg = Annotated[float, Field(ge=-180.0, le=180.0)]
@@ -143,14 +144,14 @@ class PartRecord(_Model):
 class Quality(_Model):
     """What the mapper knows about how good its map is."""
 
-    keyframes: int
-    landmarks: int
-    observations: int
+    keyframes: Total
+    landmarks: Total
+    observations: Total
     length_m: float
-    frames_total: int
-    frames_posed: int
+    frames_total: Total
+    frames_posed: Total
     reprojection_rms_px: float
-    gnss_fixes: int
+    gnss_fixes: Total
     gnss_residual_rms_m: float | None
     gnss_mode: Literal["none", "final", "full"]
     publishable: bool

@@ -14,16 +14,14 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from fleetmap.cells import decode_cell, encode_cell, merge_cells, split_into_cells
 from fleetmap.errors import MapPackageError, OutputExistsError, StorageError
 from fleetmap.files import atomic_path, refuse_existing
+from fleetmap.footprint import bounding_box, keyframes_lonlat, thinned
 from fleetmap.full_part import check_visual_map, decode_full, encode_full
-from fleetmap.geodesy import UtmGrid
 from fleetmap.geometry import Sim3, quat_xyzw_from_rotations
 from fleetmap.manifest import (
+    FORMAT_NAME,
     MAX_MANIFEST_BYTES,
     MAX_PART_BYTES,
     Manifest,
@@ -39,7 +37,6 @@ from fleetmap.visual_map import LocalizationMap, VisualMap
 
 MANIFEST_NAME = "manifest.json"
 PARTS_NAME = "parts"
-_TRAJECTORY_SPACING_M = 10.0
 
 
 @dataclass(frozen=True)
@@ -122,7 +119,7 @@ def write_package(
     """
     check_map_id(map_id)
     target = folder.resolve()
-    _refuse_foreign(target, force)
+    check_target(target, force)
     parts, manifest = _encode(visual_map, map_id, quality, provenance)
     manifest_bytes = manifest.to_bytes()
     if len(manifest_bytes) > MAX_MANIFEST_BYTES:
@@ -133,6 +130,24 @@ def write_package(
             _write_file(draft / PARTS_NAME / f"{record.sha256}.bin", data)
         _write_file(draft / MANIFEST_NAME, manifest_bytes)
     return manifest
+
+
+def check_target(folder: Path, force: bool) -> None:
+    """Refuse to write a package where one is already, and even with ``force`` where something else is.
+
+    Worth asking before the map is made: mapping takes minutes.
+
+    Raises:
+        OutputExistsError: the folder exists and ``force`` is not given, or what exists is not a map package.
+        StorageError: the place cannot be looked at.
+    """
+    try:
+        refuse_existing(folder, force)
+        is_replaceable = not folder.exists() or (folder.is_dir() and (_is_package(folder) or _is_empty(folder)))
+    except OSError as error:
+        raise StorageError(f"cannot write {folder}: {error.strerror or error}") from error
+    if not is_replaceable:
+        raise OutputExistsError(f"{folder} is not a map package, --force will not replace it; give another name")
 
 
 def open_package(folder: Path) -> MapPackage:
@@ -205,34 +220,31 @@ def _encode(
     """All parts, cells in order and the full one last, and the manifest that lists them in the same order."""
     origin = f"map '{map_id}'"
     check_visual_map(visual_map, origin)
-    if len(visual_map.keyframes) == 0:
+    keyframes, landmarks = visual_map.keyframes, visual_map.landmarks
+    if len(keyframes) == 0:
         raise MapPackageError(f"{origin} holds no keyframes")
-    keyframes, landmarks, observations = visual_map.keyframes, visual_map.landmarks, visual_map.observations
     _agree(quality.keyframes, {"keyframes": len(keyframes)}, origin)
     _agree(quality.landmarks, {"landmarks": len(landmarks)}, origin)
-    _agree(quality.observations, {"observations": len(observations)}, origin)
+    _agree(quality.observations, {"observations": len(visual_map.observations)}, origin)
     parts, records = [], []
     for index, cell in split_into_cells(visual_map).items():
         parts.append(encode_cell(index, cell, visual_map.anchor))
         records.append(_record("cell", parts[-1], len(cell.keyframe_ids), len(cell.landmark_ids), index))
     parts.append(encode_full(visual_map))
     records.append(_record("full", parts[-1], len(keyframes), len(landmarks), None))
-    lonlat = _keyframes_lonlat(visual_map)
-    manifest = make_manifest(
-        {
-            "map_id": map_id,
-            "anchor": asdict(visual_map.anchor),
-            "map_from_vis": _sim3_fields(visual_map.map_from_vis),
-            "camera": asdict(visual_map.camera),
-            "bbox_lonlat": _bounding_box(lonlat),
-            "trajectory_lonlat": lonlat[_thin(keyframes.positions_m)].tolist(),
-            "parts": records,
-            "quality": quality,
-            "provenance": provenance,
-        },
-        origin,
-    )
-    return parts, manifest
+    lonlat = keyframes_lonlat(visual_map.anchor, keyframes)
+    fields = {
+        "map_id": map_id,
+        "anchor": asdict(visual_map.anchor),
+        "map_from_vis": _sim3_fields(visual_map.map_from_vis),
+        "camera": asdict(visual_map.camera),
+        "bbox_lonlat": bounding_box(lonlat),
+        "trajectory_lonlat": lonlat[thinned(keyframes.positions_m)].tolist(),
+        "parts": records,
+        "quality": quality,
+        "provenance": provenance,
+    }
+    return parts, make_manifest(fields, origin)
 
 
 def _record(
@@ -258,46 +270,14 @@ def _sim3_fields(sim3: Sim3) -> dict[str, object]:
     }
 
 
-def _keyframes_lonlat(visual_map: VisualMap) -> NDArray[np.float64]:
-    """Longitude and latitude (K, 2) of the keyframes in degrees, to about a centimetre."""
-    in_utm = visual_map.anchor.utm_from_map(visual_map.keyframes.positions_m)
-    lat_deg, lon_deg, _ = UtmGrid(visual_map.anchor.epsg).to_geodetic(in_utm)
-    return np.asarray(np.stack([lon_deg, lat_deg], axis=1).round(7), dtype=np.float64)
+def _is_package(folder: Path) -> bool:
+    """Whether a folder holds a map package, be it damaged or of another version."""
+    manifest = folder / MANIFEST_NAME
+    return manifest.is_file() and FORMAT_NAME.encode() in _read_file(manifest, MAX_MANIFEST_BYTES)
 
 
-def _bounding_box(lonlat: NDArray[np.float64]) -> tuple[float, float, float, float]:
-    """West, south, east, north; across the antimeridian west is greater than east (RFC 7946, section 5.2)."""
-    lon_deg, lat_deg = lonlat[:, 0], lonlat[:, 1]
-    east_half = lon_deg[lon_deg > 0.0]
-    if np.ptp(lon_deg) > 180.0:
-        return (
-            float(east_half.min()),
-            float(lat_deg.min()),
-            float(lon_deg[lon_deg <= 0.0].max()),
-            float(lat_deg.max()),
-        )
-    return float(lon_deg.min()), float(lat_deg.min()), float(lon_deg.max()), float(lat_deg.max())
-
-
-def _thin(positions_m: NDArray[np.float64]) -> list[int]:
-    """Indices of positions about 10 m apart, the first and the last among them."""
-    kept = [0]
-    for index, position in enumerate(positions_m):
-        if np.linalg.norm(position - positions_m[kept[-1]]) >= _TRAJECTORY_SPACING_M:
-            kept.append(index)
-    return kept if kept[-1] == len(positions_m) - 1 else [*kept, len(positions_m) - 1]
-
-
-def _refuse_foreign(target: Path, force: bool) -> None:
-    """``force`` replaces a map package or an empty folder, and never anything else of the user's."""
-    try:
-        refuse_existing(target, force)
-        is_ours = target.is_dir() and ((target / MANIFEST_NAME).is_file() or not any(target.iterdir()))
-        is_foreign = target.exists() and not is_ours
-    except OSError as error:
-        raise StorageError(f"cannot write {target}: {error.strerror or error}") from error
-    if is_foreign:
-        raise OutputExistsError(f"{target} is not a map package, --force will not replace it; give another name")
+def _is_empty(folder: Path) -> bool:
+    return next(folder.iterdir(), None) is None
 
 
 def _read_file(path: Path, limit_bytes: int) -> bytes:
@@ -306,7 +286,7 @@ def _read_file(path: Path, limit_bytes: int) -> bytes:
         if not path.is_file():
             raise MapPackageError(f"{path} is missing; {_AGAIN}")
         with path.open("rb") as file:
-            return file.read(limit_bytes + 1)
+            return file.read(min(path.stat().st_size, limit_bytes) + 1)
 
 
 @contextmanager

@@ -127,6 +127,8 @@ def test_a_manifest_beyond_the_limit_is_refused(data: bytes, monkeypatch: pytest
         ("parts.0.kind", "full"),
         ("quality.length_m", float("inf")),
         ("quality.gnss_mode", "some"),
+        ("quality.keyframes", -1),
+        ("quality.frames_posed", 2**63),
         ("provenance.created_ns", 2**63),
         ("provenance.drive_sha256", "beef"),
         ("provenance.settings", {"threshold": float("nan")}),

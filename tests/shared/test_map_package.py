@@ -260,18 +260,30 @@ def test_an_existing_package_stays_unless_forced(write: Write, make_map: MakeMap
 
 def test_force_replaces_nothing_but_maps(write: Write, make_map: MakeMap, tmp_path: Path) -> None:
     """A slip of the keyboard must not cost a user the home folder."""
-    home, file, empty = tmp_path / "home", tmp_path / "notes.txt", tmp_path / "empty"
+    home, file, empty, extension = (tmp_path / name for name in ("home", "notes.txt", "empty", "extension"))
     home.mkdir()
+    extension.mkdir()
+    (extension / "manifest.json").write_text('{"name": "some browser extension"}')
     (home / "thesis.tex").write_text("years of work")
     file.write_text("notes")
     empty.mkdir()
-    for target in (home, file):
+    for target in (home, file, extension):
         with pytest.raises(OutputExistsError, match="is not a map package, --force will not replace it"):
             write(target, make_map(), force=True)
     assert (home / "thesis.tex").read_text() == "years of work"
     assert file.read_text() == "notes"
     write(empty, make_map(), force=True)
     verify_package(open_package(empty))
+
+
+def test_a_damaged_package_can_be_replaced(write: Write, make_map: MakeMap, tmp_path: Path) -> None:
+    write(tmp_path / "street", make_map())
+    manifest = tmp_path / "street" / "manifest.json"
+    manifest.write_bytes(manifest.read_bytes()[:-40])
+    with pytest.raises(MapPackageError, match="is not JSON"):
+        open_package(tmp_path / "street")
+    write(tmp_path / "street", make_map(), force=True)
+    verify_package(open_package(tmp_path / "street"))
 
 
 def test_the_current_folder_can_be_the_target(
