@@ -48,7 +48,7 @@ class Canvas:
         self.grey += np.float32(amplitude) * noise
 
     def patch(self, left_m: float, top_m: float, right_m: float, bottom_m: float) -> FloatImage:
-        """The sheet's own texels (h, w) of a rectangle, at least one each way; possibly empty outside the sheet."""
+        """The sheet's own texels (h, w) of a rectangle; empty outside the sheet."""
         x0, x1 = round(left_m * self.scale[0]), round(right_m * self.scale[0])
         y0, y1 = round(top_m * self.scale[1]), round(bottom_m * self.scale[1])
         return self.grey[max(y0, 0) : max(y1, y0 + 1, 0), max(x0, 0) : max(x1, x0 + 1, 0)]

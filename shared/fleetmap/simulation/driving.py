@@ -65,7 +65,7 @@ def _sway(rng: np.random.Generator, seconds: Array, fastest_hz: float) -> Array:
 
 
 def _looking_along(street: Street, s: Array) -> Array:
-    """Rotations (N, 3, 3) ``map_from_cam`` of a level-mounted camera on a car at ``s``, as wide as its wheelbase."""
+    """Rotations (N, 3, 3) ``map_from_cam`` of a camera on a car at ``s`` that turns with its wheelbase."""
     ahead, behind = street.path.at(s + 1.3), street.path.at(s - 1.3)
     forward = ahead - behind
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from fleetmap.simulation import textures
 from fleetmap.simulation.path import StreetPath
-from fleetmap.simulation.surfaces import SurfaceBuilder
+from fleetmap.simulation.surfaces import SurfaceBuilder, raised
 from fleetmap.simulation.vehicles import paint_car, park_car
 
 Array = NDArray[np.float64]
@@ -44,8 +44,8 @@ def plant_trees(rng: Rng, builder: SurfaceBuilder, path: StreetPath, left_m: flo
         builder.add_box(foot, float(rng.uniform(0.0, np.pi)), (0.34, 0.34, height + 0.3 * size), bark)
         for direction in float(rng.uniform(0.0, np.pi)) + np.arange(3) * np.pi / 3.0:
             aside = 0.5 * size * np.array([np.cos(direction), np.sin(direction), 0.0])
-            low = foot + [0.0, 0.0, height - 0.1 * size]
-            high = low + [0.0, 0.0, size * float(rng.uniform(0.9, 1.2))]
+            low = raised(foot, height - 0.1 * size)
+            high = raised(low, size * float(rng.uniform(0.9, 1.2)))
             sheet = np.stack([high - aside, high + aside, low + aside, low - aside])
             builder.add_quad(
                 sheet, int(rng.choice(leaves)), two_sided=True, lit=False, shade=float(rng.uniform(0.75, 1.1))
@@ -64,10 +64,10 @@ def place_furniture(rng: Rng, builder: SurfaceBuilder, path: StreetPath, left_m:
         kind = rng.random()
         if kind < 0.35:
             builder.add_box(foot, heading, (0.14, 0.14, 6.2), metal)
-            builder.add_box(foot + [0.0, 0.0, 6.2], heading, (0.9, 0.3, 0.15), metal)
+            builder.add_box(raised(foot, 6.2), heading, (0.9, 0.3, 0.15), metal)
         elif kind < 0.7:
             builder.add_box(foot, heading, (0.07, 0.07, 3.0), metal)
-            builder.add_box(foot + [0.0, 0.0, 2.2], heading, (0.03, 0.7, 0.7), int(rng.choice(signs)))
+            builder.add_box(raised(foot, 2.2), heading, (0.03, 0.7, 0.7), int(rng.choice(signs)))
         else:
             size = (float(rng.uniform(0.5, 1.1)), float(rng.uniform(0.4, 0.6)), float(rng.uniform(0.8, 1.3)))
             builder.add_box(foot, heading, size, int(rng.choice(boxes)))

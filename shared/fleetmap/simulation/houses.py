@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from fleetmap.simulation import textures
 from fleetmap.simulation.path import StreetPath
-from fleetmap.simulation.surfaces import SurfaceBuilder
+from fleetmap.simulation.surfaces import SurfaceBuilder, raised
 
 Array = NDArray[np.float64]
 Rng = np.random.Generator
@@ -48,7 +48,7 @@ def build_behind(rng: Rng, builder: SurfaceBuilder, path: StreetPath, span: Arra
                 continue
             footprint[:, 2] = footprint[:, 2].min() - 2.0
             walls = tuple(int(rng.choice(fronts)) for _ in range(4))
-            top = footprint + [0.0, 0.0, float(rng.uniform(9.0, 19.0))]
+            top = raised(footprint, float(rng.uniform(9.0, 19.0)))
             builder.add_prism(footprint, top, (walls[0], walls[1], walls[2], walls[3]), roof, shade=0.9)
 
 
@@ -75,7 +75,7 @@ def _build_house(rng: Rng, builder: SurfaceBuilder, near: Array, far: Array, sid
     lowest, highest = float(ground[:, 2].min()) - 0.3, float(ground[:, 2].max())
     ground[:, 2] = lowest
     wall_height = highest + height - lowest
-    eaves = ground + [0.0, 0.0, wall_height]
+    eaves = raised(ground, wall_height)
     front = builder.add_texture(textures.paint_facade(rng, width, wall_height))
     ends = [builder.add_texture(textures.paint_side(rng, depth, wall_height)) for _ in range(2)]
     sides = (ends[0], front, ends[1], hidden) if side > 0.0 else (ends[0], hidden, ends[1], front)
@@ -102,6 +102,7 @@ def _add_roof(rng: Rng, builder: SurfaceBuilder, eaves: Array, width: float, dep
     slope = builder.add_texture(textures.paint_roof(rng, width, float(np.hypot(rise, depth / 2.0))))
     hip = builder.add_texture(textures.paint_roof(rng, depth, rise))
     builder.add_prism(low, ridge, (hip, slope, hip, slope), hip)
+    builder.add_quad(low[::-1], hip)  # the eaves from below
     brick = builder.add_texture(textures.paint_plain(rng, 0.8, 1.2, 95.0, 14.0))
     foot = centre + 0.3 * lengthways[0] + 0.5 * sideways[0] + [0.0, 0.0, 0.2 * rise]
     builder.add_box(foot, _heading_rad(across), (0.8, 0.8, rise + 0.6), brick)

@@ -17,7 +17,7 @@ _BLEND_M = 3.0  # level stretch kept before and after each bend
 
 @dataclass(frozen=True)
 class StreetPath:
-    """The centre of the right-hand lane; ``s_m`` runs along it, offsets are to the left, heights are the road's."""
+    """The centre of the right-hand lane; ``s_m`` runs along it, offsets are to the left."""
 
     s_m: Array  # (N,) float64, evenly spaced
     positions_m: Array  # (N, 3) float64, map frame

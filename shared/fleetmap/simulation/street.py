@@ -7,6 +7,7 @@ three metres (parked cars) to two hundred (the horizon).
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,7 +32,7 @@ _HORIZON_M = 220.0
 
 @dataclass(frozen=True)
 class Street:
-    """A world to drive through. Its frame is the map frame of ``anchor``: grid east, grid north, height, metres."""
+    """A world to drive through, in the map frame of ``anchor``: grid east, grid north, height in metres."""
 
     anchor: UtmAnchor
     length_m: float  # drivable: s from 0 to here along the path
@@ -81,7 +82,7 @@ def _lay_ground(rng: Rng, builder: SurfaceBuilder, path: StreetPath) -> None:
     knots = path.knots(float(path.s_m[0]), float(path.s_m[-1]) - 12.0)
     right, left = _RIGHT_KERB_M, _LEFT_KERB_M
     stone = builder.add_texture(textures.paint_plain(rng, 6.0, _KERB_HEIGHT_M, 170.0, 14.0))
-    for start, end in zip(knots[:-1], knots[1:], strict=True):
+    for start, end in itertools.pairwise(knots):
         length = float(end - start)
         road = textures.paint_road(rng, length, left - right, [left - 1.75, left + 1.75, left - 5.25])
         _strip(builder, path, start, end, left, right, 0.0, builder.add_texture(road))
@@ -128,7 +129,7 @@ def _raise_horizon(rng: Rng, builder: SurfaceBuilder, path: StreetPath) -> None:
     angles = np.linspace(0.0, 2.0 * np.pi, sides + 1)
     ring = centre + radius * np.stack([np.cos(angles), np.sin(angles), 0.0 * angles], axis=1)
     width, height = 2.0 * radius * np.sin(np.pi / sides), 80.0
-    for near, far in zip(ring[1:], ring[:-1], strict=True):  # seen from inside, counter-clockwise is leftwards
+    for far, near in itertools.pairwise(ring):  # seen from inside, counter-clockwise is leftwards
         picture = builder.add_texture(textures.paint_horizon(rng, width, height, SKY_GREY))
         foot, top = [0.0, 0.0, -5.0], [0.0, 0.0, height - 5.0]
         builder.add_quad(np.stack([near + top, far + top, far + foot, near + foot]), picture, lit=False)

@@ -29,7 +29,7 @@ class Texture:
 
 @dataclass(frozen=True)
 class Surfaces:
-    """Surfaces as a struct of arrays, in the map frame. Corners: top left, top right, bottom right, bottom left."""
+    """Surfaces as a struct of arrays, in the map frame; corners run from top left by top right."""
 
     corners_in_map: Array  # (Q, 4, 3) float64
     texture_indices: NDArray[np.int64]  # (Q,) int64
@@ -41,7 +41,7 @@ class Surfaces:
 
     @cached_property
     def map_from_texture(self) -> Array:
-        """(Q, 3, 3): takes homogeneous texture coordinates (s, t, 1), each in [0, 1], to map points times a weight.
+        """(Q, 3, 3): takes texture coordinates (s, t, 1), each in [0, 1], to map points times a weight.
 
         The third row of :attr:`weights` times (s, t, 1) is that weight. From the corner correspondences; the
         general case is in P. Heckbert, "Fundamentals of Texture Mapping and Image Warping", 1989, section 2.2.3.
@@ -89,14 +89,14 @@ class SurfaceBuilder:
     def add_quad(
         self, corners_in_map: Array, texture: int, *, two_sided: bool = False, lit: bool = True, shade: float = 1.0
     ) -> None:
-        """Add a flat surface; corners (4, 3) top left, top right, bottom right, bottom left as seen from its front."""
+        """Add a flat surface; corners (4, 3) clockwise from top left, as seen from its front."""
         corners = np.asarray(corners_in_map, dtype=np.float64)
         normal = np.cross(corners[3] - corners[0], corners[1] - corners[0])
         normal /= np.linalg.norm(normal)
         if abs(float((corners[2] - corners[0]) @ normal)) > _PLANARITY_M:
             raise ValueError(f"the four corners of a surface do not lie in one plane: {corners.tolist()}")
         sun = float(normal @ self.sun_in_map)
-        brightness = shade * (0.5 + 0.55 * max(abs(sun) if two_sided else sun, 0.0)) if lit else shade
+        brightness = shade * (0.42 + 0.9 * max(abs(sun) if two_sided else sun, 0.0)) if lit else shade
         self._corners.append(corners)
         self._texture_indices.append(texture)
         self._brightness.append(brightness)
@@ -119,7 +119,7 @@ class SurfaceBuilder:
         along = 0.5 * size_m[0] * np.array([np.cos(heading_rad), np.sin(heading_rad), 0.0])
         left = 0.5 * size_m[1] * np.array([-np.sin(heading_rad), np.cos(heading_rad), 0.0])
         base = foot + np.stack([along + left, along - left, -along - left, left - along])
-        self.add_prism(base, base + [0.0, 0.0, size_m[2]], (texture, texture, texture, texture), texture)
+        self.add_prism(base, raised(base, size_m[2]), (texture, texture, texture, texture), texture)
 
     def surfaces(self) -> Surfaces:
         """All surfaces added so far."""
@@ -129,3 +129,8 @@ class SurfaceBuilder:
             np.array(self._brightness),
             np.array(self._two_sided),
         )
+
+
+def raised(points: Array, height_m: float) -> Array:
+    """Points (..., 3) moved straight up."""
+    return np.asarray(points + np.array([0.0, 0.0, height_m]))

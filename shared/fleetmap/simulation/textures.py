@@ -1,6 +1,6 @@
 """Painters of the street's textures: ground, walls, roofs, cars, leaves and the far background.
 
-Each has detail from metres down to its texels (about two centimetres), so that a camera finds corners near and far.
+Each has detail from metres down to its texels (about two centimetres): corners for cameras near and far.
 """
 
 from __future__ import annotations
@@ -271,9 +271,9 @@ def paint_horizon(rng: Rng, width_m: float, height_m: float, sky_grey: float) ->
     scene = Canvas(rng, width_m, height_m, 5.0, sky_grey)
     rows, columns = scene.grey.shape
     x = np.arange(columns)
-    for layer, (top, grey) in enumerate(((0.55, 185.0), (0.42, 150.0), (0.3, 105.0))):
-        ridge = fractal_noise(rng, (64, columns), columns / (3.0 + 4.0 * layer), 0.55)[32]
-        heights = np.clip(rows * (top + 0.07 * ridge), 4, 0.9 * rows)
+    for layer, (top, grey) in enumerate(((0.32, 190.0), (0.25, 160.0), (0.19, 115.0))):
+        ridge = fractal_noise(rng, (64, columns), columns / 2.0, 0.4 + 0.08 * layer)[32]
+        heights = np.clip(rows * (top + 0.05 * ridge), 4, 0.9 * rows)
         if layer == 2:  # houses: steps instead of hills
             heights = np.repeat(heights[::40], 40)[:columns]
         below = np.arange(rows)[:, None] >= rows - heights[x]

@@ -7,12 +7,13 @@ and outline of a surface agree to rounding.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import find_objects
 
 from fleetmap.camera import Camera
 from fleetmap.geometry import Pose
@@ -21,10 +22,12 @@ from fleetmap.simulation.surfaces import GreyImage, Surfaces
 
 Array = NDArray[np.float64]
 FloatImage = NDArray[np.float32]
-Ids = NDArray[np.int64]
+Ids = NDArray[np.int32]
+Boxes = list[tuple[slice, slice] | None]  # rows, columns of each surface
 
 NOTHING = -1  # the id of the sky
 _NEAR_M = 0.2
+_EMPTY = (slice(0, 0), slice(0, 0))
 
 
 @dataclass(frozen=True)
@@ -33,17 +36,12 @@ class View:
 
     texture_from_ray: Array  # (Q, 3, 3): rows give s, t and their common denominator
     inverse_depth: Array  # (Q, 3): 1 / z = row @ d
-    corners_in_cam: Array  # (Q, 4, 3)
-    front_to_back: Ids  # (M,) the surfaces that may be in view
-
-    def narrowed_to(self, ids: Ids) -> View:
-        """The same view without the surfaces that are not among the ids of an image."""
-        seen = np.zeros(len(self.inverse_depth) + 1, dtype=np.bool_)
-        seen[ids.ravel()] = True
-        return replace(self, front_to_back=self.front_to_back[seen[self.front_to_back]])
+    outlines_in_cam: Array  # (Q, 8, 3): corners, and where edges cross the near plane
+    on_outline: NDArray[np.bool_]  # (Q, 8): which of them bound the part before the near plane
+    front_to_back: NDArray[np.int64]  # (M,) the surfaces that may be in view
 
 
-def view_of(surfaces: Surfaces, camera: Camera, map_from_cam: Pose) -> View:
+def view_of(surfaces: Surfaces, map_from_cam: Pose) -> View:
     """Carry surfaces into a camera's frame; those behind it or turned away are left out of ``front_to_back``."""
     weights = surfaces.weights
     texture = surfaces.map_from_texture - map_from_cam.translation_m[:, None] * weights[:, 2:3]
@@ -54,9 +52,20 @@ def view_of(surfaces: Surfaces, camera: Camera, map_from_cam: Pose) -> View:
     texture_from_ray[faces] = np.linalg.inv(ray_from_texture[faces])
     inverse_depth = (weights[:, 2:3] @ texture_from_ray)[:, 0]
     corners = (surfaces.corners_in_map - map_from_cam.translation_m) @ map_from_cam.rotation
-    candidates = np.flatnonzero(faces & (corners[..., 2].max(axis=1) > _NEAR_M))
+    outlines, on_outline = _cut_at_near_plane(corners)
+    candidates = np.flatnonzero(faces & on_outline.any(axis=1))
     distance = np.linalg.norm(corners[candidates].mean(axis=1), axis=1)
-    return View(texture_from_ray, inverse_depth, corners, candidates[np.argsort(distance, kind="stable")])
+    front_to_back = candidates[np.argsort(distance, kind="stable")]
+    return View(texture_from_ray, inverse_depth, outlines, on_outline, front_to_back)
+
+
+def _cut_at_near_plane(corners: Array) -> tuple[Array, NDArray[np.bool_]]:
+    following = np.roll(corners, -1, axis=1)
+    depth, next_depth = corners[..., 2], following[..., 2]
+    crossing = (depth - _NEAR_M) * (next_depth - _NEAR_M) < 0.0
+    fraction = np.where(crossing, (_NEAR_M - depth) / np.where(crossing, next_depth - depth, 1.0), 0.0)
+    cuts = corners + fraction[..., None] * (following - corners)
+    return np.concatenate([corners, cuts], axis=1), np.concatenate([depth >= _NEAR_M, crossing], axis=1)
 
 
 @dataclass(frozen=True)
@@ -71,11 +80,13 @@ class Grid:
     px_per_unit: tuple[float, float]  # fx, fy
     pixel_x: FloatImage  # (H, W)
     pixel_y: FloatImage  # (H, W)
-    nearest: tuple[Ids, Ids] | None  # row and column of each pixel's neighbour; None: the same grid
+    nearest: (
+        tuple[NDArray[np.int64], NDArray[np.int64]] | None
+    )  # row and column of each pixel's neighbour; None: the same grid
 
-    def rays(self) -> tuple[FloatImage, FloatImage]:
-        """Ray coordinates x, y of the pixels, each (H, W), undistorted."""
-        return self.pixel_x, self.pixel_y
+    def at_pixels(self, ids: Ids) -> Ids:
+        """Values (H', W') of the even grid at the pixels (H, W)."""
+        return ids if self.nearest is None else ids[self.nearest]
 
 
 @lru_cache(maxsize=16)
@@ -94,67 +105,73 @@ def sampling_grid(camera: Camera, shift_px: tuple[float, float]) -> Grid:
         nearest = (row, column)
     else:
         x, y = x[:-1], y[:-1]
-    x, y, rays = x.astype(np.float32), y.astype(np.float32), rays.astype(np.float32)
-    pixel_x, pixel_y = np.ascontiguousarray(rays[..., 0]), np.ascontiguousarray(rays[..., 1])
-    return Grid(x, y, (camera.fx_px, camera.fy_px), pixel_x, pixel_y, nearest)
+    pixel_x, pixel_y = (np.ascontiguousarray(rays[..., i], dtype=np.float32) for i in range(2))
+    focal_px = (camera.fx_px, camera.fy_px)
+    return Grid(x.astype(np.float32), y.astype(np.float32), focal_px, pixel_x, pixel_y, nearest)
 
 
-def visible_surfaces(surfaces: Surfaces, atlas: Atlas, view: View, grid: Grid) -> Ids:
-    """Id (H, W) of the surface that each pixel sees; NOTHING for the sky."""
+def boxes_in_view(view: View, grid: Grid) -> Boxes:
+    """Rows and columns of the even grid that hold the outline of each surface; None when out of view."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        rays = view.outlines_in_cam[..., :2] / view.outlines_in_cam[..., 2:]
+    low = np.where(view.on_outline[..., None], rays, np.inf).min(axis=1)
+    high = np.where(view.on_outline[..., None], rays, -np.inf).max(axis=1)
+    origin, size = np.array([grid.x[0], grid.y[0]], dtype=np.float64), np.array([len(grid.x), len(grid.y)])
+    first = np.clip(np.floor((low - origin) * grid.px_per_unit), 0, size).astype(np.int64)
+    last = np.clip(np.ceil((high - origin) * grid.px_per_unit) + 1, 0, size).astype(np.int64)
+    return [
+        (slice(top, bottom), slice(left, right)) if top < bottom and left < right else None
+        for (left, top), (right, bottom) in zip(first.tolist(), last.tolist(), strict=True)
+    ]
+
+
+def boxes_seen(ids: Ids, count: int) -> Boxes:
+    """Rows and columns where each surface was seen, two pixels wider; None for those that were not seen.
+
+    Enough for renderings shifted by less than a pixel; it misses what is thinner than a pixel everywhere.
+    """
+    found = find_objects(ids + 1)
+    seen: Boxes = [None] * count
+    for surface, box in enumerate(found):
+        if box is not None:
+            rows, columns = (slice(max(side.start - 2, 0), side.stop + 2) for side in box)
+            seen[surface] = rows, columns
+    return seen
+
+
+def visible_surfaces(surfaces: Surfaces, atlas: Atlas, view: View, boxes: Boxes, grid: Grid) -> Ids:
+    """Id (H', W') of the surface seen at each place of the even grid; NOTHING for the sky."""
     nearest = np.zeros((len(grid.y), len(grid.x)), dtype=np.float32)  # inverse depth
     ids = np.full(nearest.shape, NOTHING, dtype=np.int32)
-    boxes, nearest_corner = _boxes(view, grid)
-    texture_rows, depth_rows = view.texture_from_ray.astype(np.float32), view.inverse_depth.astype(np.float32)
+    s, t, scale = view.texture_from_ray.transpose(1, 0, 2)
+    # All that must be positive where a surface is hit: the distances from its four edges, and 1 / z.
+    planes = np.stack([s, t, scale - s, scale - t, view.inverse_depth], axis=1).astype(np.float32)
+    largest = 1.001 / np.where(view.on_outline, view.outlines_in_cam[..., 2], np.inf).min(axis=1)
     for surface in view.front_to_back.tolist():
-        left, top, right, bottom = boxes[surface]
-        buffer = nearest[top:bottom, left:right]
-        if not buffer.size or nearest_corner[surface] < buffer.min():
+        rows, columns = boxes[surface] or _EMPTY
+        buffer = nearest[rows, columns]
+        if not buffer.size or largest[surface] < buffer.min():
             continue
-        x, y = grid.x[left:right], grid.y[top:bottom, None]
-        s, t, scale = (_affine(row, x, y) for row in texture_rows[surface])
-        inverse_depth = _affine(depth_rows[surface], x, y)
-        inside = np.minimum(np.minimum(s, t), scale - np.maximum(s, t))
-        mask = (inside >= 0.0) & (inverse_depth > buffer)
+        values = _affine(planes[surface], grid.x[columns], grid.y[rows])
+        mask = (values[:4].min(axis=0) >= 0.0) & (values[4] > buffer)
         pyramid = atlas.opacities[surfaces.texture_indices[surface]]
         if pyramid is not None:
-            mask &= _is_opaque(pyramid, s, t, scale)
+            scale_here = values[0] + values[2]
+            mask &= _is_opaque(pyramid, values[0] / scale_here, values[1] / scale_here)
         seen = mask.view(np.uint8)  # cv2.copyTo writes into the views in place, faster than numpy's masked copy
-        cv2.copyTo(inverse_depth, seen, buffer)
-        cv2.copyTo(np.full(seen.shape, surface, dtype=np.int32), seen, ids[top:bottom, left:right])
-    return ids.astype(np.int64) if grid.nearest is None else ids[grid.nearest].astype(np.int64)
+        cv2.copyTo(values[4], seen, buffer)
+        cv2.copyTo(np.full(seen.shape, surface, dtype=np.int32), seen, ids[rows, columns])
+    return ids
 
 
-def _affine(row: FloatImage, x: FloatImage, y: FloatImage) -> FloatImage:
-    """row @ (x, y, 1) on the grid of x (W,) and y (H, 1)."""
-    return np.asarray(row[0] * x + (row[1] * y + row[2]))
+def _affine(rows: FloatImage, x: FloatImage, y: FloatImage) -> FloatImage:
+    """rows (K, 3) @ (x, y, 1) on the grid of x (W,) and y (H,): (K, H, W)."""
+    across, down = rows[:, :1] * x, rows[:, 1:2] * y + rows[:, 2:]
+    return np.asarray(across[:, None, :] + down[:, :, None])
 
 
-def _boxes(view: View, grid: Grid) -> tuple[list[list[int]], list[float]]:
-    """Box (left, top, right, bottom exclusive) of each surface, empty when out of view, and its largest 1 / z."""
-    corners = view.corners_in_cam
-    following = np.roll(corners, -1, axis=1)
-    depth, next_depth = corners[..., 2], following[..., 2]
-    crossing = (depth - _NEAR_M) * (next_depth - _NEAR_M) < 0.0
-    with np.errstate(divide="ignore", invalid="ignore"):
-        fraction = ((_NEAR_M - depth) / (next_depth - depth))[..., None]
-        points = np.concatenate([corners, corners + fraction * (following - corners)], axis=1)
-        valid = np.concatenate([depth >= _NEAR_M, crossing], axis=1)
-        rays = points[..., :2] / points[..., 2:]
-    low = np.where(valid[..., None], rays, np.inf).min(axis=1)
-    high = np.where(valid[..., None], rays, -np.inf).max(axis=1)
-    origin, size = np.array([grid.x[0], grid.y[0]], dtype=np.float64), np.array([len(grid.x), len(grid.y)])
-    first = np.clip(np.floor((low - origin) * grid.px_per_unit), 0, size)
-    last = np.clip(np.ceil((high - origin) * grid.px_per_unit) + 1, 0, size)
-    largest = 1.001 / np.where(valid, points[..., 2], np.inf).min(axis=1)
-    return np.concatenate([first, last], axis=1).astype(np.int64).tolist(), largest.tolist()
-
-
-def _is_opaque(
-    pyramid: tuple[GreyImage, ...], s: FloatImage, t: FloatImage, scale: FloatImage
-) -> NDArray[np.bool_]:
+def _is_opaque(pyramid: tuple[GreyImage, ...], s: FloatImage, t: FloatImage) -> NDArray[np.bool_]:
     """Where a see-through texture is solid, read from the level that fits the box."""
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        s, t = s / scale, t / scale
     texels_per_px = pyramid[0].shape[0] * np.median(np.abs(np.diff(t, axis=0))) if len(t) > 1 else np.inf
     level = pyramid[int(np.clip(np.log2(max(float(texels_per_px), 1.0)), 0, MAX_LEVEL))]
     column = s * np.float32(level.shape[1]) - np.float32(0.5)
