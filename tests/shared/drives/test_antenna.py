@@ -65,7 +65,7 @@ def test_a_chain_of_transforms_in_mixed_directions_is_walked(drive_with, caplog)
 
 
 def test_a_usual_body_to_optical_mounting_gives_the_arm_by_hand(drive_with):
-    # Camera 2 m ahead of base and 1 m up, looking forward; antenna at base, 3 m up: 2 m behind, 2 m above the camera.
+    # Camera 2 m ahead of base, 1 m up, looking forward; antenna 0.5 m left of base, 3 m up.
     base_from_cam = Pose(OPTICAL_FROM_BODY.T, np.array([2.0, 0.0, 1.0]))
     base_from_gnss = Pose(np.eye(3), np.array([0.0, 0.5, 3.0]))
     drive = drive_with(link("base", "cam", base_from_cam), link("base", "gnss", base_from_gnss))

@@ -266,7 +266,7 @@ class TestFixes:
     def test_two_receivers_matter_only_when_gnss_is_read(self, fixes_of):
         drive = fixes_of({"topic": "/a/fix"}, {"topic": "/b/fix"})
         assert len(list(drive.frames())) == 1
-        with pytest.raises(DriveError, match="/a/fix, /b/fix.*--gnss-topic"):
+        with pytest.raises(DriveError, match=r"/a/fix, /b/fix.*--gnss-topic"):
             drive.gnss_fixes()
 
     def test_one_of_two_receivers_can_be_chosen(self, fixes_of):

@@ -111,10 +111,15 @@ def test_a_jpeg_of_the_writer_is_close_to_the_image(tmp_path, pictures):
     assert 0.0 < np.abs(frame.image.astype(float) - pictures[0]).mean() < 1.0
 
 
-def test_an_error_in_the_block_leaves_nothing_behind(tmp_path, pictures):
-    with pytest.raises(RuntimeError, match="on the way"), DriveWriter(tmp_path / "drive.mcap", CAMERA) as writer:
-        writer.write_image(T0_NS, pictures[0])
+def write_and_fail(unopened, picture):
+    with unopened as writer:
+        writer.write_image(T0_NS, picture)
         raise RuntimeError("on the way")
+
+
+def test_an_error_in_the_block_leaves_nothing_behind(tmp_path, pictures):
+    with pytest.raises(RuntimeError, match="on the way"):
+        write_and_fail(DriveWriter(tmp_path / "drive.mcap", CAMERA), pictures[0])
     assert list(tmp_path.iterdir()) == []
 
 
@@ -122,9 +127,8 @@ def test_an_existing_recording_is_kept_unless_forced(written, pictures):
     before = written.read_bytes()
     with pytest.raises(OutputExistsError, match="--force"):
         DriveWriter(written, CAMERA)
-    with pytest.raises(RuntimeError), DriveWriter(written, CAMERA, force=True) as writer:
-        writer.write_image(T0_NS, pictures[0])
-        raise RuntimeError
+    with pytest.raises(RuntimeError, match="on the way"):
+        write_and_fail(DriveWriter(written, CAMERA, force=True), pictures[0])
     assert written.read_bytes() == before
     with DriveWriter(written, CAMERA, force=True) as writer:
         writer.write_image(T0_NS, pictures[0])
