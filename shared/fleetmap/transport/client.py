@@ -142,7 +142,8 @@ class MapClient:
         except NoAnswerError as error:
             raise TransferError(
                 f"upload of map '{upload.map_id}' ended at {_mb(upload.done_bytes)} of "
-                f"{_mb(upload.total_bytes)} MB: map server at {self.endpoint} answers no more; publish again to go on from there"
+                f"{_mb(upload.total_bytes)} MB: map server at {self.endpoint} answers no more; "
+                "publish again to go on from there"
             ) from error
 
     def _chunks(self, version: str, sha256: str, size_bytes: int) -> Iterator[bytes]:

@@ -59,6 +59,10 @@ class Hello(_Message):
     fleetmap_version: str
 
 
+class HelloRequest(_Message):
+    """Is a map server there?"""
+
+
 class Problem(_Message):
     """A problem document (RFC 9457): why a request was not served."""
 

@@ -1,0 +1,50 @@
+"""``fleetmap publish``: send a map to the server."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+from tqdm import tqdm
+
+from fleetmap.catalogue import MapEntry
+from fleetmap.map_package import MapPackage, open_package, verify_package
+from fleetmap.transport import DEFAULT_ENDPOINT, MapClient
+
+
+@click.command()
+@click.argument("folder", type=click.Path(path_type=Path))
+@click.option(
+    "--server", metavar="tcp/HOST:PORT", default=DEFAULT_ENDPOINT, show_default=True, help="The map server."
+)
+def publish(folder: Path, server: str) -> None:
+    """Send the map in FOLDER to the map server, where it becomes the latest of its id.
+
+    Every part is checked first. An upload that was cut goes on where it stopped when the command is
+    run again; what the server already has is not sent.
+
+    \b
+    Example:
+      fleetmap publish my_map --server tcp/127.0.0.1:7447
+    """
+    package = open_package(folder)
+    verify_package(package)
+    if not package.manifest.quality.publishable:
+        reasons = "; ".join(package.manifest.quality.warnings) or "its quality check says so"
+        click.echo(f"warning: map '{package.manifest.map_id}' should not be published: {reasons}", err=True)
+    entry = publish_package(package, server)
+    click.echo(f"published {entry.map_id}  version {entry.version[:12]}  {entry.size_bytes / 1e6:.2f} MB")
+
+
+def publish_package(package: MapPackage, server: str) -> MapEntry:
+    """Send a package to the server at an endpoint, with a progress bar; raises as ``MapClient.publish``."""
+    with (
+        MapClient(server) as client,
+        tqdm(desc="publish", unit="B", unit_scale=True, unit_divisor=1000, leave=False) as bar,
+    ):
+
+        def show(done_bytes: int, total_bytes: int) -> None:
+            bar.total = total_bytes
+            bar.update(done_bytes - bar.n)
+
+        return client.publish(package.manifest_bytes, package.part_bytes, show)
