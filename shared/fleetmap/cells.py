@@ -27,6 +27,7 @@ from fleetmap.visual_map import Keyframes, Landmarks, LocalizationMap, VisualMap
 
 Ids = NDArray[np.int64]
 CellIndex = tuple[int, int]  # floor(easting / 128), floor(northing / 128)
+MAX_CELL_BYTES = 128 * 1024 * 1024  # inflated; two million landmarks
 _MM_PER_M = 1000
 _MAX_FLOAT16 = 65504.0
 _UNIT_TOLERANCE = 1e-6
@@ -63,7 +64,11 @@ def split_into_cells(visual_map: VisualMap) -> dict[CellIndex, Cell]:
 
 
 def encode_cell(index: CellIndex, cell: Cell, anchor: UtmAnchor) -> bytes:
-    """The part of one cell of a map that passed check_visual_map."""
+    """The part of one cell of a map that passed check_visual_map.
+
+    Raises:
+        MapPackageError: the cell exceeds MAX_CELL_BYTES.
+    """
     offset_m = _corner_m(index) - anchor.offset_m
     points_mm = np.rint(cell.landmarks.points_m * _MM_PER_M) - offset_m * _MM_PER_M
     arrays = {
@@ -80,7 +85,7 @@ def encode_cell(index: CellIndex, cell: Cell, anchor: UtmAnchor) -> bytes:
         "seen_by_keyframe": cell.seen_by_keyframe.astype("<u4"),
         "seen_landmark": cell.seen_landmark.astype("<u4"),
     }
-    return encode_part("cell", _attributes(index, anchor), arrays)
+    return encode_part("cell", _attributes(index, anchor), arrays, MAX_CELL_BYTES)
 
 
 def decode_cell(data: bytes, record: PartRecord, anchor: UtmAnchor, origin: str) -> Cell:
@@ -89,7 +94,7 @@ def decode_cell(data: bytes, record: PartRecord, anchor: UtmAnchor, origin: str)
     Raises:
         MapPackageError: the part is malformed, or is not the cell that the manifest's record describes.
     """
-    part = decode_part(data, origin)
+    part = decode_part(data, origin, MAX_CELL_BYTES)
     wanted = _attributes(record.cell, anchor) if record.cell else {}
     if part.kind != "cell" or {key: part.attributes.get(key) for key in wanted} != wanted or not record.cell:
         raise MapPackageError(

@@ -102,11 +102,16 @@ class Part:
         return np.array(planes.T, order="C").view(dtype).reshape(record.shape)
 
 
-def encode_part(kind: str, attributes: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> bytes:
+def encode_part(
+    kind: str,
+    attributes: Mapping[str, Any],
+    arrays: Mapping[str, NDArray[Any]],
+    max_payload_bytes: int = MAX_PAYLOAD_BYTES,
+) -> bytes:
     """The bytes of a part; the arrays keep their order.
 
     Raises:
-        MapPackageError: the arrays together exceed the format's limit.
+        MapPackageError: the arrays together exceed ``max_payload_bytes``.
     """
     records, planes, offset = [], [], 0
     for name, values in arrays.items():
@@ -117,8 +122,8 @@ def encode_part(kind: str, attributes: Mapping[str, Any], arrays: Mapping[str, N
             {"name": name, "dtype": dtype.str, "shape": values.shape, "offset": offset, "length": stored.size}
         )
         offset += stored.size
-    if offset > MAX_PAYLOAD_BYTES:
-        raise MapPackageError(f"a '{kind}' part of {offset} bytes exceeds {MAX_PAYLOAD_BYTES}; split the drive")
+    if offset > max_payload_bytes:
+        raise MapPackageError(f"a '{kind}' part of {offset} bytes exceeds {max_payload_bytes}; split the drive")
     header = json.dumps(
         {"kind": kind, "attributes": dict(attributes), "payload_bytes": offset, "arrays": records},
         sort_keys=True,
@@ -129,8 +134,8 @@ def encode_part(kind: str, attributes: Mapping[str, Any], arrays: Mapping[str, N
     return preamble + header + zlib.compress(b"".join(planes), _DEFLATE_LEVEL)
 
 
-def decode_part(data: bytes, origin: str) -> Part:
-    """Read a part; ``origin`` says in messages where it came from.
+def decode_part(data: bytes, origin: str, max_payload_bytes: int = MAX_PAYLOAD_BYTES) -> Part:
+    """Read a part that inflates to at most ``max_payload_bytes``; ``origin`` says where it came from.
 
     Raises:
         MapPackageError: no part, truncated, damaged, larger than it may be, or of another major version.
@@ -145,6 +150,10 @@ def decode_part(data: bytes, origin: str) -> Part:
         first = error.errors()[0]
         place = ".".join(str(step) for step in first["loc"])
         raise MapPackageError(f"{origin} has a header that does not hold at '{place}': {first['msg']}") from error
+    if header.payload_bytes > max_payload_bytes:
+        raise MapPackageError(
+            f"{origin} declares {header.payload_bytes} bytes, at most {max_payload_bytes} may be"
+        )
     records = {record.name: record for record in header.arrays}
     if len(records) != len(header.arrays):
         raise MapPackageError(f"{origin} names an array twice")

@@ -220,10 +220,14 @@ def test_a_declared_gigabyte_that_is_not_there_is_not_allocated(explode: Explode
     assert peak < 2_000_000
 
 
-def test_a_payload_beyond_the_limit_is_not_written(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parts, "MAX_PAYLOAD_BYTES", 95)
+def test_a_payload_beyond_the_limit_is_neither_written_nor_read() -> None:
+    arrays = {"points": np.zeros((4, 3))}
     with pytest.raises(MapPackageError, match="96 bytes exceeds 95; split the drive"):
-        one_array()
+        encode_part("cell", {}, arrays, 95)
+    data = encode_part("cell", {}, arrays, 96)
+    decode_part(data, "here", 96)
+    with pytest.raises(MapPackageError, match="here declares 96 bytes, at most 95 may be"):
+        decode_part(data, "here", 95)
 
 
 @settings(max_examples=300, deadline=None)
