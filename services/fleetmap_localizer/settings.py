@@ -26,7 +26,7 @@ class RelocalizationSettings:
     min_shared_landmarks: int = 15  # to call two keyframes covisible
     max_distance: int = 64  # Hamming bits
     ratio: float = 0.85
-    min_matches: int = 15
+    min_matches: int = 12
     min_ransac_inliers: int = 10
     ransac_error_px: float = 6.0
     radii_px: tuple[float, ...] = (12.0, 5.0)  # windows around the projections, round after round
@@ -49,12 +49,12 @@ class TrackingSettings:
 class GateSettings:
     """What a pose must show before it is reported: no pose is better than a wrong one."""
 
-    min_inliers_tracking: int = 20
-    min_inliers_relocalization: int = 30
+    min_inliers_tracking: int = 15
+    min_inliers_relocalization: int = 20
     min_inlier_ratio: float = 0.5  # inliers per matched landmark
     min_seen_ratio: float = 0.06  # inliers per landmark that should be in view
-    min_occupied_cells: int = 8  # of a grid of 8 x 4 over the image
-    max_position_sigma_m: float = 0.5
+    min_occupied_cells: int = 6  # of a grid of 8 x 4 over the image
+    max_position_sigma_m: float = 0.3
     max_rotation_sigma_deg: float = 1.0
 
 
