@@ -52,7 +52,7 @@ def read_trajectory(path: Path) -> Trajectory:
     """Read TUM text.
 
     Raises:
-        TrajectoryError: no such file, no ``# epsg=`` line, a malformed line, or stamps that do not increase.
+        TrajectoryError: no such file, no ``# epsg=`` line of a UTM zone, a malformed line, or stamps that do not increase.
     """
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
@@ -61,6 +61,8 @@ def read_trajectory(path: Path) -> Trajectory:
     epsg = next((int(m[1]) for line in lines if (m := re.match(r"#\s*epsg\s*=\s*(\d+)\s*$", line))), None)
     if epsg is None:
         raise TrajectoryError(f"{path} names no UTM zone: its first line must read like '# epsg=32632'")
+    if not (32601 <= epsg <= 32660 or 32701 <= epsg <= 32760):
+        raise TrajectoryError(f"{path}: EPSG:{epsg} is no UTM zone on WGS84 (326xx north, 327xx south)")
     rows = [
         _parse_row(path, number, line)
         for number, line in enumerate(lines, start=1)
@@ -83,8 +85,8 @@ def _parse_row(path: Path, number: int, line: str) -> tuple[int, list[float]]:
         values = [float(field) for field in fields[1:]]
         if not np.all(np.isfinite(values)) or abs(np.linalg.norm(values[3:]) - 1.0) > 1e-3:
             raise ValueError("numbers that are not finite, or no unit quaternion")
-        return _stamp_ns(fields[0]), values
-    except ValueError as error:
+        return int(np.int64(_stamp_ns(fields[0]))), values
+    except (ValueError, OverflowError) as error:
         raise TrajectoryError(f"{path} line {number} is not 'stamp_s x y z qx qy qz qw': {error}") from error
 
 

@@ -1,0 +1,82 @@
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fleetmap.camera import Camera
+from fleetmap.errors import CalibrationError
+
+KITTI = Camera(
+    1392, 512, 984.2439, 980.8141, 690.0, 233.1966, (-0.3728755, 0.2037299, 0.002219, 0.0013837, -0.0723)
+)
+IDEAL = Camera(640, 480, 500.0, 510.0, 319.5, 239.5)
+
+pixels_of_kitti = st.tuples(st.floats(0.0, 1391.0), st.floats(0.0, 511.0))
+
+
+@given(st.lists(pixels_of_kitti, min_size=1, max_size=20), st.floats(0.5, 100.0))
+def test_unproject_and_project_are_inverses_all_over_a_real_wide_image(pixels, depth_m):
+    pixels = np.array(pixels)
+    rays = KITTI.unproject(pixels)
+    assert rays[:, 2] == pytest.approx(np.ones(len(pixels)))
+    assert np.abs(KITTI.project(depth_m * rays) - pixels).max() < 1e-3
+
+
+@given(st.lists(pixels_of_kitti, min_size=1, max_size=20))
+def test_undistorted_pixels_are_what_the_ideal_camera_sees(pixels):
+    rays = KITTI.unproject(np.array(pixels))
+    assert np.allclose(KITTI.project_ideal(rays), KITTI.undistort(np.array(pixels)), atol=1e-9)
+
+
+def test_projection_agrees_with_opencv():
+    rng = np.random.default_rng(0)
+    points = np.stack([rng.uniform(-3, 3, 200), rng.uniform(-1, 1, 200), rng.uniform(5, 20, 200)], axis=1)
+    expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), KITTI.matrix, np.array(KITTI.distortion))
+    assert np.abs(KITTI.project(points) - expected.reshape(-1, 2)).max() < 1e-9
+    assert np.abs(KITTI.project(points) - KITTI.project_ideal(points)).max() > 5.0  # distortion is not small here
+
+
+def test_a_point_on_the_axis_is_the_principal_point():
+    assert IDEAL.project(np.array([[0.0, 0.0, 7.0]])) == pytest.approx(np.array([[319.5, 239.5]]))
+
+
+def test_right_is_x_and_down_is_y():
+    (pixel,) = IDEAL.project(np.array([[1.0, 1.0, 10.0]]))
+    assert pixel == pytest.approx([369.5, 290.5])
+
+
+@pytest.mark.parametrize("depth_m", [0.0, -5.0, float("nan")])
+def test_points_not_in_front_have_no_pixel(depth_m):
+    for camera in (IDEAL, KITTI):
+        assert np.isnan(camera.project(np.array([[1.0, 1.0, depth_m]]))).all()
+        assert np.isnan(camera.project_ideal(np.array([[1.0, 1.0, depth_m]]))).all()
+
+
+def test_without_distortion_undistorting_changes_nothing():
+    pixels = np.array([[0.0, 0.0], [639.0, 479.0]])
+    assert np.array_equal(IDEAL.undistort(pixels), pixels)
+
+
+def test_the_image_ends_at_the_centres_of_its_outer_pixels():
+    pixels = np.array([[0.0, 0.0], [639.0, 479.0], [-0.1, 5.0], [639.1, 5.0], [5.0, 479.1], [np.nan, 5.0]])
+    assert IDEAL.is_inside(pixels).tolist() == [True, True, False, False, False, False]
+    assert IDEAL.is_inside(np.array([[9.9, 50.0], [10.0, 50.0]]), border_px=10.0).tolist() == [False, True]
+
+
+@pytest.mark.parametrize(
+    "numbers",
+    [
+        (0, 480, 500.0, 500.0, 320.0, 240.0),
+        (640, -1, 500.0, 500.0, 320.0, 240.0),
+        (640, 480, 0.0, 500.0, 320.0, 240.0),
+        (640, 480, 500.0, -1.0, 320.0, 240.0),
+        (640, 480, float("nan"), 500.0, 320.0, 240.0),
+        (640, 480, 500.0, 500.0, float("inf"), 240.0),
+    ],
+)
+def test_a_camera_that_cannot_be_is_refused(numbers):
+    with pytest.raises(CalibrationError, match="not usable"):
+        Camera(*numbers)
