@@ -63,7 +63,7 @@ def _shrink(texels_per_px: FloatArray) -> FloatArray:
 
     The exponent of a float is its floored binary logarithm; the factor rounds it to the nearer level.
     """
-    exponent = (np.maximum(texels_per_px * np.float32(1.35), np.float32(1.0)).view(np.int32) >> 23) - 127
+    exponent = (np.maximum(texels_per_px * np.float32(1.6), np.float32(1.0)).view(np.int32) >> 23) - 127
     return np.asarray(((127 - np.minimum(exponent, MAX_LEVEL)) << 23).view(np.float32))
 
 
