@@ -52,7 +52,8 @@ def read_trajectory(path: Path) -> Trajectory:
     """Read TUM text.
 
     Raises:
-        TrajectoryError: no such file, no ``# epsg=`` line of a UTM zone, a malformed line, or stamps that do not increase.
+        TrajectoryError: no such file, no ``# epsg=`` line of a UTM zone, a malformed line, or stamps that do
+            not increase.
     """
     try:
         lines = path.read_text(encoding="utf-8").splitlines()

@@ -125,7 +125,7 @@ def _look_at_camera(drive: Ros2Drive, missing: list[str]) -> Camera | None:
     try:
         return drive.camera
     except InputError as error:
-        missing.append(f"calibration: {error}; without it the drive can be neither mapped nor localised")
+        missing.append(f"calibration: {error}")
         return None
 
 

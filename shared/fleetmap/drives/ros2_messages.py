@@ -17,6 +17,7 @@ CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 NAV_SAT_FIX = "sensor_msgs/msg/NavSatFix"
 TF_MESSAGE = "tf2_msgs/msg/TFMessage"
 
+_ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _IDL_RULER = "=" * 80 + "\n"
 
 
@@ -33,6 +34,11 @@ class MessageDecoder:
         Raises:
             DriveError: the bytes do not fit the definition.
         """
+        if data.startswith(_ZSTD_MAGIC):
+            raise DriveError(
+                f"the messages of {self._topic.name} are compressed one by one; unpack the recording with"
+                " 'ros2 bag convert' (compression of whole chunks is fine)"
+            )
         try:
             return self._typestore.deserialize_cdr(data, self._topic.message_type)
         except Exception as error:  # generated code: damaged bytes can raise anything
@@ -82,12 +88,18 @@ def _typestore_of(topic: Topic) -> Typestore:
             typestore.register(get_types_from_msg(topic.schema_text, topic.message_type))
         typestore.get_msgdef(topic.message_type)
     except Exception as error:  # a parser fed with foreign text
-        raise DriveError(f"the message definition of {topic.name} cannot be understood: {error}") from error
+        raise DriveError(
+            f"the message definition of {topic.name} ({topic.message_type}) cannot be understood:"
+            f" {' '.join(str(error).split())}"
+        ) from error
     return typestore
 
 
 def _idl_documents(bundle: str) -> list[str]:
-    """rosbag2 bundles IDL files, each under a ruler and a line ``IDL: package/msg/Name``."""
+    """rosbag2 bundles IDL files, each under a ruler and a line ``IDL: package/msg/Name``; includes are inside."""
+    without_includes = "".join(
+        line for line in bundle.splitlines(keepends=True) if not line.startswith("#include")
+    )
     if not bundle.startswith(_IDL_RULER):
-        return [bundle]
-    return [part.partition("\n")[2] for part in bundle.split(_IDL_RULER)[1:]]
+        return [without_includes]
+    return [part.partition("\n")[2] for part in without_includes.split(_IDL_RULER)[1:]]

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from mcap.writer import CompressionType, IndexType, Writer
 from rosbags.rosbag2 import Writer as Rosbag2Writer
-from rosbags.rosbag2.enums import StoragePlugin
+from rosbags.rosbag2.enums import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.typesys import Stores, get_typestore
 
 from fleetmap.camera import Camera
@@ -25,16 +25,27 @@ FRAME_NS = 100_000_000
 class ForeignRecorder:
     """Writes ROS 2 messages as other tools do; log times are the stamps unless given."""
 
-    def __init__(self, path: Path, *, rosbag2: bool = False, schema_text: bool = True, **options: Any) -> None:
+    def __init__(
+        self,
+        path: Path,
+        *,
+        rosbag2: bool = False,
+        schema_text: bool = True,
+        idl: dict[str, str] | None = None,
+        compression_mode: CompressionMode = CompressionMode.NONE,
+        **options: Any,
+    ) -> None:
         self.path, self._rosbag2, self._schema_text, self._options = path, rosbag2, schema_text, options
+        self._idl, self._compression_mode = idl or {}, compression_mode
         self._channels: dict[str, Any] = {}
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
         if self._rosbag2:
-            self._bag = self._stack.enter_context(
-                Rosbag2Writer(self.path, version=9, storage_plugin=StoragePlugin.MCAP)
-            )
+            bag = Rosbag2Writer(self.path, version=9, storage_plugin=StoragePlugin.MCAP)
+            if self._compression_mode != CompressionMode.NONE:
+                bag.set_compression(self._compression_mode, CompressionFormat.ZSTD)
+            self._bag = self._stack.enter_context(bag)
         else:
             file = self._stack.enter_context(self.path.open("wb"))
             self._mcap = Writer(file, **{"chunk_size": 20_000, **self._options})
@@ -55,7 +66,10 @@ class ForeignRecorder:
             return
         if topic not in self._channels:
             text = TYPES.generate_msgdef(message.__msgtype__, ros_version=2)[0] if self._schema_text else ""
-            schema_id = self._mcap.register_schema(message.__msgtype__, "ros2msg", text.encode())
+            kind = "ros2msg"
+            if message.__msgtype__ in self._idl:
+                kind, text = "ros2idl", self._idl[message.__msgtype__]
+            schema_id = self._mcap.register_schema(message.__msgtype__, kind, text.encode())
             self._channels[topic] = self._mcap.register_channel(topic, encoding, schema_id)
         self._mcap.add_message(self._channels[topic], stamp_ns, data, stamp_ns)
 
@@ -194,7 +208,7 @@ def street(record: Callable[..., ForeignRecorder], small_camera: Camera, picture
     return build
 
 
-ALL_BUT_INDEX = {
+KINDS_OF_FILE = {
     "no chunks": {"use_chunking": False},
     "no index": {"index_types": IndexType.NONE},
     "no statistics": {"use_statistics": False},
@@ -214,7 +228,7 @@ ALL_BUT_INDEX = {
 }
 
 
-@pytest.fixture(params=ALL_BUT_INDEX.values(), ids=ALL_BUT_INDEX.keys())
+@pytest.fixture(params=KINDS_OF_FILE.values(), ids=KINDS_OF_FILE.keys())
 def kind_of_file(request: pytest.FixtureRequest) -> dict[str, Any]:
     """The kinds of MCAP that the format allows."""
     options: dict[str, Any] = request.param

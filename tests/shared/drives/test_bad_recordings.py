@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
+from mcap.writer import CompressionType
+from rosbags.rosbag2.enums import CompressionMode
+from rosbags.typesys import Stores, get_typestore
 
 from fleetmap.drives import open_drive
 from fleetmap.errors import CalibrationError, DriveError
@@ -52,8 +56,6 @@ def test_a_recording_cut_in_the_middle_but_with_both_ends_is_damaged(street):
 
 
 def test_flipped_bits_are_found_by_the_checksum(street):
-    from mcap.writer import CompressionType
-
     path = street(compression=CompressionType.NONE)
     data = bytearray(path.read_bytes())
     data[len(data) // 3] ^= 0xFF
@@ -74,8 +76,6 @@ def test_a_recording_without_images_says_what_it_holds(record):
 
 
 def test_images_that_are_not_in_cdr_do_not_count(record, street):
-    from rosbags.typesys import Stores, get_typestore
-
     message = get_typestore(Stores.ROS2_JAZZY).types["sensor_msgs/msg/CompressedImage"]
     with record() as recorder:
         recorder.write("/image", message, T0_NS, encoding="json", data=b"{}")
@@ -93,8 +93,6 @@ def test_images_that_are_not_in_cdr_do_not_count(record, street):
     ],
 )
 def test_an_image_that_cannot_be_decoded_is_named(record, small_camera, pictures, data, reason):
-    import cv2
-
     if data == "truncated":
         whole = cv2.imencode(".jpg", pictures[1])[1].tobytes()
         data = whole[: len(whole) // 2]
@@ -142,8 +140,6 @@ def test_images_that_contradict_their_calibration_are_refused_with_numbers(recor
 
 
 def test_a_message_that_does_not_fit_its_definition_is_refused(record, small_camera, pictures):
-    from rosbags.typesys import Stores, get_typestore
-
     message = get_typestore(Stores.ROS2_JAZZY).types["sensor_msgs/msg/CompressedImage"]
     with record() as recorder:
         recorder.camera_info("/x/camera_info", T0_NS, small_camera, "cam")
@@ -160,6 +156,22 @@ def test_a_static_transform_that_is_none_is_refused(record, small_camera, pictur
         recorder.transforms(T0_NS, ("cam", "gnss", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)))
     with pytest.raises(DriveError, match="from 'cam' to 'gnss' is no rigid transform"):
         open_drive(recorder.path).antenna()
+
+
+@pytest.mark.parametrize(
+    ("mode", "message"), [(CompressionMode.MESSAGE, "compressed one by one"), (CompressionMode.FILE, "zstd -d")]
+)
+def test_compression_that_is_not_read_names_the_way_out(street, mode, message):
+    assert message in refusal_of(street("bag", rosbag2=True, compression_mode=mode))
+
+
+@pytest.mark.parametrize("text", ["no definition", "uint8[ broken", "other_msgs/Thing thing"])
+def test_a_message_definition_that_is_none_is_refused(record, small_camera, text):
+    message = get_typestore(Stores.ROS2_JAZZY).types["sensor_msgs/msg/CompressedImage"]
+    with record(idl={"sensor_msgs/msg/CompressedImage": text}) as recorder:
+        recorder.write("/x/image", message, T0_NS, data=b"\x00\x01\x00\x00")
+        recorder.camera_info("/x/camera_info", T0_NS, small_camera, "cam")
+    assert "the message definition of /x/image" in refusal_of(recorder.path)
 
 
 def test_a_folder_without_mcap_names_what_to_do(tmp_path):

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
+from rosbags.rosbag2.enums import CompressionMode
 
 from fleetmap.drives import open_drive
 from fleetmap.drives.ros2_values import UNKNOWN_COVARIANCE_SIGMA_M
@@ -43,6 +45,32 @@ def test_a_rosbag2_folder_is_opened_by_its_folder(street, small_camera, pictures
     drive = open_drive(folder)
     assert_is_the_street(drive, small_camera, pictures)
     assert drive.name == "bag.mcap"
+
+
+COMPRESSED_IMAGE_IDL = f"""{"=" * 80}
+IDL: sensor_msgs/msg/CompressedImage
+#include "std_msgs/msg/Header.idl"
+module sensor_msgs {{ module msg {{
+  struct CompressedImage {{ std_msgs::msg::Header header; string format; sequence<uint8> data; }};
+}}; }};
+{"=" * 80}
+IDL: std_msgs/msg/Header
+#include "builtin_interfaces/msg/Time.idl"
+module std_msgs {{ module msg {{ struct Header {{ builtin_interfaces::msg::Time stamp; string frame_id; }}; }}; }};
+{"=" * 80}
+IDL: builtin_interfaces/msg/Time
+module builtin_interfaces {{ module msg {{ struct Time {{ int32 sec; uint32 nanosec; }}; }}; }};
+"""
+
+
+def test_definitions_in_idl_are_understood(street, small_camera, pictures):
+    path = street(idl={"sensor_msgs/msg/CompressedImage": COMPRESSED_IMAGE_IDL})
+    assert_is_the_street(open_drive(path), small_camera, pictures)
+
+
+def test_a_rosbag2_folder_with_compressed_chunks_is_read(street, small_camera, pictures):
+    folder = street("bag", rosbag2=True, compression_mode=CompressionMode.STORAGE)
+    assert_is_the_street(open_drive(folder), small_camera, pictures)
 
 
 def test_frames_can_be_read_twice_and_side_by_side(street):
@@ -99,8 +127,6 @@ def test_a_png_arrives_without_loss(record, small_camera, pictures):
 class TestTwoCameras:
     @pytest.fixture
     def two_cameras(self, record, small_camera, pictures):
-        from dataclasses import replace
-
         right = replace(small_camera, fx_px=60.0)
         with record() as recorder:
             for name, camera, frame_id in (("left", small_camera, "cam_l"), ("right", right, "cam_r")):
@@ -131,8 +157,6 @@ class TestCalibration:
 
     @pytest.fixture
     def wide(self, small_camera):
-        from dataclasses import replace
-
         return replace(small_camera, fx_px=20.0)
 
     def test_the_same_frame_wins_over_the_sibling_name(self, record, small_camera, wide, pictures):

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
@@ -89,8 +90,6 @@ def test_another_tool_reads_the_same(written):
 
 
 def test_a_jpeg_passes_through_byte_by_byte(tmp_path, pictures):
-    import cv2
-
     jpeg = cv2.imencode(".jpg", pictures[0])[1].tobytes()
     with DriveWriter(tmp_path / "drive.mcap", CAMERA) as writer:
         writer.write_jpeg(T0_NS, jpeg)
