@@ -14,6 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from fleetmap.camera import Camera
+from fleetmap.geometry import nearest_rotations
 
 Array = NDArray[np.float64]
 
@@ -50,6 +51,9 @@ class Adjusted:
 def adjust(problem: AdjustmentProblem, iterations: int = 10) -> Adjusted:
     """Move the free poses and all points to the (local) optimum."""
     camera = problem.camera
+    at_start = squared_errors(problem, problem.rotations, problem.translations, problem.points)
+    # What starts behind its camera takes no part: a step that brought it to the front would look like progress.
+    weights = np.where(np.isfinite(at_start), 1.0 / problem.sigmas_px, 0.0)
     starts = np.searchsorted(problem.point_index, np.arange(len(problem.points) + 1)).astype(np.int64)
     rotations, translations, points, cost = _levenberg_marquardt(
         np.array([camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px]),
@@ -60,16 +64,15 @@ def adjust(problem: AdjustmentProblem, iterations: int = 10) -> Adjusted:
         np.ascontiguousarray(problem.keyframe_index, dtype=np.int64),
         starts,
         np.ascontiguousarray(problem.pixels, dtype=np.float64),
-        1.0 / np.ascontiguousarray(problem.sigmas_px, dtype=np.float64),
+        weights,
         iterations,
     )
+    rotations = nearest_rotations(rotations)
     chi2 = squared_errors(problem, rotations, translations, points)
     return Adjusted(rotations, translations, points, chi2, cost)
 
 
-def squared_errors(
-    problem: AdjustmentProblem, rotations: Array, translations: Array, points: Array
-) -> Array:
+def squared_errors(problem: AdjustmentProblem, rotations: Array, translations: Array, points: Array) -> Array:
     """Squared normalised reprojection error of every observation (M,); inf behind the camera."""
     k, p = problem.keyframe_index, problem.point_index
     points_in_cam = np.einsum("mij,mj->mi", rotations[k], points[p]) + translations[k]
@@ -78,7 +81,7 @@ def squared_errors(
     return np.where(np.isfinite(chi2), chi2, np.inf)
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _levenberg_marquardt(  # type: ignore[no-untyped-def]
     intrinsics, rotations, translations, fixed, points, keyframe_index, starts, pixels, weights, iterations
 ):
@@ -115,12 +118,14 @@ def _levenberg_marquardt(  # type: ignore[no-untyped-def]
     return rotations, translations, points, cost
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _cost(intrinsics, rotations, translations, points, keyframe_index, starts, pixels, weights):  # type: ignore[no-untyped-def]
     fx, fy, cx, cy = intrinsics
     total = 0.0
     for j in range(len(points)):
         for m in range(starts[j], starts[j + 1]):
+            if weights[m] == 0.0:
+                continue
             R, t = rotations[keyframe_index[m]], translations[keyframe_index[m]]
             x = R[0, 0] * points[j, 0] + R[0, 1] * points[j, 1] + R[0, 2] * points[j, 2] + t[0]
             y = R[1, 0] * points[j, 0] + R[1, 1] * points[j, 1] + R[1, 2] * points[j, 2] + t[1]
@@ -135,7 +140,7 @@ def _cost(intrinsics, rotations, translations, points, keyframe_index, starts, p
     return total
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _normal_equations(  # type: ignore[no-untyped-def]
     intrinsics, rotations, translations, points, keyframe_index, starts, pixels, weights, slots, free
 ):
@@ -147,6 +152,8 @@ def _normal_equations(  # type: ignore[no-untyped-def]
     Jp, Jl, r = np.zeros((2, 6)), np.zeros((2, 3)), np.zeros(2)
     for j in range(len(points)):
         for m in range(starts[j], starts[j + 1]):
+            if weights[m] == 0.0:
+                continue
             k = keyframe_index[m]
             R, t = rotations[k], translations[k]
             x = R[0, 0] * points[j, 0] + R[0, 1] * points[j, 1] + R[0, 2] * points[j, 2] + t[0]
@@ -186,7 +193,7 @@ def _normal_equations(  # type: ignore[no-untyped-def]
     return U, gp, V, gl, W
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _solve(U, gp, V, gl, W, keyframe_index, starts, slots, free, damping):  # type: ignore[no-untyped-def]
     """One damped step: poses from the reduced camera system, points by back-substitution."""
     S, b = np.zeros((6 * free, 6 * free)), np.zeros(6 * free)
@@ -206,7 +213,9 @@ def _solve(U, gp, V, gl, W, keyframe_index, starts, slots, free, damping):  # ty
                 continue
             for c in range(6):
                 for d in range(3):
-                    Y[c, d] = W[m, c, 0] * V_inv[j, 0, d] + W[m, c, 1] * V_inv[j, 1, d] + W[m, c, 2] * V_inv[j, 2, d]
+                    Y[c, d] = (
+                        W[m, c, 0] * V_inv[j, 0, d] + W[m, c, 1] * V_inv[j, 1, d] + W[m, c, 2] * V_inv[j, 2, d]
+                    )
                 b[6 * s + c] += Y[c, 0] * gl[j, 0] + Y[c, 1] * gl[j, 1] + Y[c, 2] * gl[j, 2]
             for n in range(starts[j], starts[j + 1]):
                 q = slots[keyframe_index[n]]
@@ -214,7 +223,9 @@ def _solve(U, gp, V, gl, W, keyframe_index, starts, slots, free, damping):  # ty
                     continue
                 for c in range(6):
                     for d in range(6):
-                        S[6 * s + c, 6 * q + d] -= Y[c, 0] * W[n, d, 0] + Y[c, 1] * W[n, d, 1] + Y[c, 2] * W[n, d, 2]
+                        S[6 * s + c, 6 * q + d] -= (
+                            Y[c, 0] * W[n, d, 0] + Y[c, 1] * W[n, d, 1] + Y[c, 2] * W[n, d, 2]
+                        )
     for c in range(6 * free):
         for d in range(c):
             S[c, d] = S[d, c]
@@ -235,7 +246,7 @@ def _solve(U, gp, V, gl, W, keyframe_index, starts, slots, free, damping):  # ty
     return dp, dl
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _inverse_3x3(A, damping):  # type: ignore[no-untyped-def]
     d = 1.0 + damping
     a00, a11, a22 = A[0, 0] * d + 1e-12, A[1, 1] * d + 1e-12, A[2, 2] * d + 1e-12
@@ -249,7 +260,7 @@ def _inverse_3x3(A, damping):  # type: ignore[no-untyped-def]
     return inverse / determinant
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _moved(rotations, translations, slots, dp):  # type: ignore[no-untyped-def]
     """Poses after a left perturbation exp([rotation, translation]) to first order in the coupling."""
     new_rotations, new_translations = rotations.copy(), translations.copy()
@@ -263,7 +274,7 @@ def _moved(rotations, translations, slots, dp):  # type: ignore[no-untyped-def]
     return new_rotations, new_translations
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _rotation_of(wx, wy, wz):  # type: ignore[no-untyped-def]
     """Rodrigues' formula."""
     angle = np.sqrt(wx * wx + wy * wy + wz * wz)

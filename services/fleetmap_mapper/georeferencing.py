@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,7 +58,9 @@ def gnss_track(fixes: Sequence[GnssFix], antenna_in_cam_m: Array) -> GnssTrack:
         DriveError: no fixes at all.
     """
     if not fixes:
-        raise DriveError("the recording has no usable GNSS fix (NavSatFix with status >= 0); a map needs them for place and scale")
+        raise DriveError(
+            "the recording has no usable GNSS fix (NavSatFix, status >= 0); a map needs them for place and scale"
+        )
     grid = UtmGrid.at(fixes[0].lat_deg, fixes[0].lon_deg)
     positions = grid.from_geodetic(
         np.array([f.lat_deg for f in fixes]),
@@ -116,7 +119,9 @@ def georeference(path: Sequence[PathPoint], track: GnssTrack, level_sigma_deg: f
         antenna = S.transform(positions) + (S.rotation @ rotations) @ track.antenna_in_cam_m
         errors = np.einsum("fij,fj->fi", whiten, antenna - targets)
         norms = np.linalg.norm(errors, axis=1)
-        huber = np.where(norms > HUBER_SIGMAS, np.sqrt(HUBER_SIGMAS * (2 * norms - HUBER_SIGMAS)), norms)
+        huber = np.where(
+            norms > HUBER_SIGMAS, np.sqrt(HUBER_SIGMAS * np.maximum(2 * norms - HUBER_SIGMAS, 0.0)), norms
+        )
         errors *= (huber / np.maximum(norms, 1e-12))[:, None]
         level = (S.rotation @ rotations)[:, 2, 0].mean() / np.radians(level_sigma_deg)
         return np.append(errors.ravel(), level)
@@ -124,7 +129,7 @@ def georeference(path: Sequence[PathPoint], track: GnssTrack, level_sigma_deg: f
     first = _umeyama_with_lever_arm(positions, rotations, targets, track.antenna_in_cam_m)
     fits = []
     for start in (first, _levelled(first, positions, rotations)):
-        fit = least_squares(lambda delta, start=start: residuals(start, delta), np.zeros(7), x_scale="jac")
+        fit = least_squares(partial(residuals, start), np.zeros(7), x_scale="jac")
         fits.append((float(fit.cost), at(start, fit.x)))
     return min(fits, key=lambda f: f[0])[1]
 
@@ -132,7 +137,7 @@ def georeference(path: Sequence[PathPoint], track: GnssTrack, level_sigma_deg: f
 def _check_observable(fixes: NDArray[np.int64], track: GnssTrack) -> None:
     if len(fixes) < MIN_FIXES:
         raise DriveError(
-            f"only {len(fixes)} of {len(track)} GNSS fixes lie between posed images; at least {MIN_FIXES} are needed"
+            f"only {len(fixes)} of {len(track)} GNSS fixes lie between posed images; {MIN_FIXES} are needed"
         )
     positions = track.positions_m[fixes]
     span_m = float(np.linalg.norm(positions.max(axis=0) - positions.min(axis=0)))

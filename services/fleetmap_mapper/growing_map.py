@@ -125,11 +125,14 @@ class GrowingMap:
         gone = sources[ended != sources]
         self.merged_into[gone] = target[gone]
         self.alive[gone] = False
+        is_target = np.zeros(self.landmark_count + 1, np.bool_)  # the last entry stands for "no landmark"
+        is_target[target[gone]] = True
+        following = np.append(target, np.int32(-1))
         for keyframe in self.keyframes:
-            held = keyframe.landmark_of >= 0
-            if np.any(target[keyframe.landmark_of[held]] != keyframe.landmark_of[held]):
-                keyframe.landmark_of[held] = target[keyframe.landmark_of[held]]
-                _drop_repeats(keyframe.landmark_of)
+            renamed = following[keyframe.landmark_of]
+            if np.any(renamed != keyframe.landmark_of):
+                keyframe.landmark_of = renamed
+                _drop_repeats(keyframe.landmark_of, np.flatnonzero(is_target[renamed]))
 
     def resolve(self, ids: Ids) -> Ids:
         """What became of landmarks that were fused since; -1 for those that died."""
@@ -185,9 +188,9 @@ def _end(target: Ids, index: int) -> int:
     return index
 
 
-def _drop_repeats(landmark_of: Ids) -> None:
-    """After a fusion an image may hold one landmark twice: keep the first feature."""
-    held = np.flatnonzero(landmark_of >= 0)
-    _, first = np.unique(landmark_of[held], return_index=True)
-    repeats = np.setdiff1d(held, held[first])
-    landmark_of[repeats] = -1
+def _drop_repeats(landmark_of: Ids, rows: NDArray[np.intp]) -> None:
+    """After a fusion an image may hold one landmark twice, in some of these rows: keep the first feature."""
+    _, first = np.unique(landmark_of[rows], return_index=True)
+    repeated = np.ones(len(rows), np.bool_)
+    repeated[first] = False
+    landmark_of[rows[repeated]] = -1

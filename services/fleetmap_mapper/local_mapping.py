@@ -29,9 +29,7 @@ def extend_map(growing: GrowingMap, keyframe: Keyframe, settings: MapperSettings
     adjust_locally(growing, keyframe, settings.mapping.window)
 
 
-def triangulate_between(
-    growing: GrowingMap, older: Keyframe, newer: Keyframe, settings: MapperSettings
-) -> None:
+def triangulate_between(growing: GrowingMap, older: Keyframe, newer: Keyframe, settings: MapperSettings) -> None:
     """New landmarks from features of two keyframes that hold none yet."""
     camera, a, b = growing.camera, older.features, newer.features
     baseline = float(np.linalg.norm(newer.vis_from_cam.translation_m - older.vis_from_cam.translation_m))
@@ -79,6 +77,14 @@ def _fuse_into(
     landmarks, features = match_landmarks(
         growing, keyframe.features, keyframe.vis_from_cam, new, radius_px, settings.tracking
     )
+    fits = is_consistent(
+        growing.camera,
+        keyframe.vis_from_cam,
+        growing.points[landmarks],
+        keyframe.features.pixels[features],
+        keyframe.features.sigmas_px[features],
+    )
+    landmarks, features = landmarks[fits], features[fits]
     held = keyframe.landmark_of[features]
     empty = held < 0
     keyframe.landmark_of[features[empty]] = landmarks[empty]

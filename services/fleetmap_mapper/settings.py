@@ -16,7 +16,7 @@ class _Group(BaseModel):
 class FeatureGroup(_Group):
     """What is extracted from every image."""
 
-    count: int = Field(default=2000, ge=200, le=10_000)
+    count: int = Field(default=4000, ge=200, le=10_000)
 
 
 class InitialisationGroup(_Group):

@@ -30,14 +30,20 @@ _RELOCALISE_AGAINST = 10
 
 @dataclass(frozen=True)
 class PosedFrame:
-    """A frame with what was seen in it; its pose is in ``vis`` and provisional until the map is final."""
+    """A frame with what was seen in it; its pose hangs on a keyframe, so it moves when the map is adjusted."""
 
     frame_index: int
     stamp_ns: int
-    vis_from_cam: Pose
+    keyframe: Keyframe
+    keyframe_from_cam: Pose
     landmarks: Ids  # (n,)
     pixels: NDArray[np.float64]  # (n, 2) undistorted
     sigmas_px: NDArray[np.float64]  # (n,)
+
+    @property
+    def vis_from_cam(self) -> Pose:
+        """The pose as the map stands now."""
+        return self.keyframe.vis_from_cam @ self.keyframe_from_cam
 
 
 @dataclass(frozen=True)
@@ -49,12 +55,13 @@ class Unposed:
     features: Features
 
 
+OnKeyframe = Callable[[GrowingMap, list[PosedFrame]], None]
+
+
 class Slam:
     """The state of one run; feed it frames in order, then call ``finish``."""
 
-    def __init__(
-        self, camera: Camera, settings: MapperSettings, on_keyframe: Callable[[GrowingMap], None] | None = None
-    ) -> None:
+    def __init__(self, camera: Camera, settings: MapperSettings, on_keyframe: OnKeyframe | None = None) -> None:
         self.growing = GrowingMap(camera)
         self.posed: dict[int, PosedFrame] = {}
         self._settings = settings
@@ -77,9 +84,10 @@ class Slam:
             if len(self.growing.keyframes) < _YOUNG_MAP_KEYFRAMES:
                 self._start_again(frame)
             return
-        self._remember(frame, tracked)
         if self._is_keyframe(tracked):
             self._insert_keyframe(frame, tracked)
+        else:
+            self._remember(frame, tracked, self.growing.keyframes[-1])
 
     def finish(self) -> list[PosedFrame]:
         """Pose the frames that were left waiting; returns all posed frames in time order.
@@ -88,7 +96,9 @@ class Slam:
             MappingError: no two views ever made a map.
         """
         if not self.growing.keyframes:
-            raise MappingError("no map could be started: the images show too little texture or the camera did not move")
+            raise MappingError(
+                "no map could be started: the images show too little texture or the camera did not move"
+            )
         self._pose_waiting_frames()
         return [self.posed[index] for index in sorted(self.posed)]
 
@@ -113,16 +123,20 @@ class Slam:
         adjust_keyframes(self.growing, [a, b], iterations=20)
         for unposed, keyframe in ((first, a), (second, b)):
             rows = np.flatnonzero(keyframe.landmark_of >= 0)
-            self._remember(unposed, Tracked(keyframe.vis_from_cam, keyframe.landmark_of[rows], rows.astype(np.int32)))
+            tracked = Tracked(keyframe.vis_from_cam, keyframe.landmark_of[rows], rows.astype(np.int32))
+            self._remember(unposed, tracked, keyframe)
         self._waiting = [w for w in self._waiting if w.frame_index not in (first.frame_index, second.frame_index)]
         self._tracked_at_keyframe = len(b.landmarks())
 
     def _track(self, frame: Unposed) -> Tracked | None:
         assert self._last is not None
-        covisible = self.growing.covisible(self.growing.resolve(self._last.landmarks))
+        known = self.growing.resolve(self._last.landmarks)
+        covisible = self.growing.covisible(known[known >= 0])
         near = [k for k, _ in covisible[: self._settings.tracking.local_keyframes]]
         local = self.growing.landmarks_of(near)
-        tracked = track(self.growing, frame.features, self._predict(frame.stamp_ns), local, self._settings.tracking)
+        tracked = track(
+            self.growing, frame.features, self._predict(frame.stamp_ns), local, self._settings.tracking
+        )
         if tracked is None:
             recent = self.growing.keyframes[: -_RELOCALISE_AGAINST - 1 : -1]
             tracked = relocalise(
@@ -139,11 +153,12 @@ class Slam:
         fraction = (stamp_ns - self._last.stamp_ns) / (self._last.stamp_ns - self._before_last.stamp_ns)
         return self._last.vis_from_cam @ interpolate_pose(Pose.identity(), motion, fraction)
 
-    def _remember(self, frame: Unposed, tracked: Tracked) -> None:
+    def _remember(self, frame: Unposed, tracked: Tracked, keyframe: Keyframe) -> None:
         posed = PosedFrame(
             frame.frame_index,
             frame.stamp_ns,
-            tracked.vis_from_cam,
+            keyframe,
+            keyframe.vis_from_cam.inverse() @ tracked.vis_from_cam,
             tracked.landmarks,
             frame.features.pixels[tracked.features],
             frame.features.sigmas_px[tracked.features],
@@ -170,20 +185,11 @@ class Slam:
         landmark_of = _none(frame.features)
         landmark_of[tracked.features] = tracked.landmarks
         keyframe = self._add_keyframe(frame, tracked.vis_from_cam, landmark_of)
+        self._remember(frame, tracked, keyframe)
         extend_map(self.growing, keyframe, self._settings)
         self._tracked_at_keyframe = len(tracked.landmarks)
         if self._on_keyframe is not None:
-            self._on_keyframe(self.growing)
-        self._follow(keyframe)
-
-    def _follow(self, keyframe: Keyframe) -> None:
-        """The adjustment moved the newest keyframe: the motion model continues from where it is now."""
-        assert self._last is not None
-        if self._before_last is not None:
-            motion = self._before_last.vis_from_cam.inverse() @ self._last.vis_from_cam
-            moved = keyframe.vis_from_cam @ motion.inverse()
-            self._before_last = _with_pose(self._before_last, moved)
-        self._last = _with_pose(self._last, keyframe.vis_from_cam)
+            self._on_keyframe(self.growing, list(self.posed.values()))
 
     def _add_keyframe(self, frame: Unposed, vis_from_cam: Pose, landmark_of: Ids) -> Keyframe:
         return self.growing.add_keyframe(
@@ -211,14 +217,14 @@ class Slam:
                 self._last, self._before_last = neighbour, self.posed.get(index + 2 * step)
                 tracked = self._track(waiting[index])
                 if tracked is not None:
-                    self._remember(waiting[index], tracked)
+                    self._remember(waiting[index], tracked, neighbour.keyframe)
 
 
 def run_slam(
     frames: Iterable[Frame],
     camera: Camera,
     settings: MapperSettings,
-    on_keyframe: Callable[[GrowingMap], None] | None = None,
+    on_keyframe: OnKeyframe | None = None,
 ) -> tuple[GrowingMap, list[PosedFrame]]:
     """Feed a whole drive through SLAM."""
     extractor = FeatureExtractor(camera, FeatureSettings(count=settings.features.count))
@@ -231,9 +237,3 @@ def run_slam(
 
 def _none(features: Features) -> Ids:
     return np.full(len(features), -1, np.int32)
-
-
-def _with_pose(posed: PosedFrame, vis_from_cam: Pose) -> PosedFrame:
-    return PosedFrame(
-        posed.frame_index, posed.stamp_ns, vis_from_cam, posed.landmarks, posed.pixels, posed.sigmas_px
-    )

@@ -7,8 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.geometry import Pose
-from fleetmap.vision.absolute_pose import AbsolutePose, AbsolutePoseSettings, estimate_absolute_pose, refine_absolute_pose
+from fleetmap.geometry import Pose, nearest_rotations
+from fleetmap.vision.absolute_pose import (
+    AbsolutePose,
+    AbsolutePoseSettings,
+    estimate_absolute_pose,
+    refine_absolute_pose,
+)
 from fleetmap.vision.features import Features
 from fleetmap.vision.matching import match_by_projection, match_descriptors
 from fleetmap_mapper.growing_map import SCALE_FACTOR, GrowingMap, Ids, Keyframe
@@ -40,9 +45,7 @@ def track(
             break
     else:
         return None
-    fine = _project_and_refine(
-        growing, features, coarse.vis_from_cam, local, settings.refined_radius_px, settings
-    )
+    fine = _project_and_refine(growing, features, coarse.vis_from_cam, local, settings.refined_radius_px, settings)
     if fine is None or len(fine.landmarks) < settings.min_inliers:
         return None
     growing.found[fine.landmarks] += 1
@@ -56,12 +59,18 @@ def relocalise(
     """Match a frame with whole keyframes, without any prediction; the first that holds decides."""
     for keyframe in keyframes:
         seen = np.flatnonzero(keyframe.landmark_of >= 0).astype(np.int32)
-        pairs = match_descriptors(keyframe.features.descriptors[seen], features.descriptors, settings.max_hamming, 0.8)
+        pairs = match_descriptors(
+            keyframe.features.descriptors[seen], features.descriptors, settings.max_hamming, 0.8
+        )
         if len(pairs) < settings.min_inliers:
             continue
         landmarks, found = keyframe.landmark_of[seen[pairs[:, 0]]], pairs[:, 1]
         pose = estimate_absolute_pose(
-            features.pixels[found], growing.points[landmarks], features.sigmas_px[found], growing.camera, AbsolutePoseSettings(seed=seed)
+            features.pixels[found],
+            growing.points[landmarks],
+            features.sigmas_px[found],
+            growing.camera,
+            AbsolutePoseSettings(seed=seed),
         )
         if pose is None or pose.inliers.sum() < settings.min_inliers:
             continue
@@ -85,7 +94,7 @@ def match_landmarks(
     ids = local[rows]
     found = match_by_projection(
         pixels,
-        radius_px * SCALE_FACTOR**octaves.astype(np.float64),
+        radius_px * SCALE_FACTOR ** octaves.astype(np.float64),
         octaves - 1,
         octaves + 1,
         growing.descriptors[ids],
@@ -113,7 +122,8 @@ def _project_and_refine(
     )
     if pose is None:
         return None
-    return Tracked(pose.map_from_cam, landmarks[pose.inliers], found[pose.inliers])
+    rotation = nearest_rotations(pose.map_from_cam.rotation)  # or its error triples from frame to frame
+    return Tracked(Pose(rotation, pose.map_from_cam.translation_m), landmarks[pose.inliers], found[pose.inliers])
 
 
 def _visible(

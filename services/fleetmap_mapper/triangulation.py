@@ -12,9 +12,7 @@ Array = NDArray[np.float64]
 CHI2_2DOF_95 = 5.991
 
 
-def triangulate(
-    camera: Camera, world_from_a: Pose, pixels_a: Array, world_from_b: Pose, pixels_b: Array
-) -> Array:
+def triangulate(camera: Camera, world_from_a: Pose, pixels_a: Array, world_from_b: Pose, pixels_b: Array) -> Array:
     """Midpoints (N, 3) of the shortest segments between the viewing rays of undistorted pixels (N, 2).
 
     Source: Hartley & Sturm, "Triangulation", CVIU 1997, section 5.1; bundle adjustment refines them.
@@ -29,7 +27,7 @@ def triangulate(
         reach_b = (cos * along_a - along_b) / (1.0 - cos * cos)
     ends_a = world_from_a.translation_m + reach_a[:, None] * rays_a
     ends_b = world_from_b.translation_m + reach_b[:, None] * rays_b
-    return 0.5 * (ends_a + ends_b)
+    return np.asarray(0.5 * (ends_a + ends_b))
 
 
 def parallax_rad(points: Array, centre_a: Array, centre_b: Array) -> Array:
@@ -40,7 +38,9 @@ def parallax_rad(points: Array, centre_a: Array, centre_b: Array) -> Array:
         return np.asarray(np.arctan2(cross, (a * b).sum(axis=1)))
 
 
-def is_consistent(camera: Camera, world_from_cam: Pose, points: Array, pixels: Array, sigmas_px: Array) -> NDArray[np.bool_]:
+def is_consistent(
+    camera: Camera, world_from_cam: Pose, points: Array, pixels: Array, sigmas_px: Array
+) -> NDArray[np.bool_]:
     """Which points (N, 3) lie in front of a camera and within 95 % of their pixels (N, 2)."""
     predicted = camera.project_ideal(world_from_cam.inverse().transform(points))
     with np.errstate(invalid="ignore"):

@@ -92,6 +92,12 @@ def umeyama_alignment(source: Array, target: Array, with_scale: bool = True) -> 
     return Sim3(scale, rotation, target_mean - scale * rotation @ source_mean)  # eq. 41
 
 
+def nearest_rotations(matrices: Array) -> Array:
+    """The rotation matrices (..., 3, 3) nearest to almost-rotations; long products drift off SO(3) and grow."""
+    U, _, Vt = np.linalg.svd(matrices)
+    return np.asarray(U @ Vt)
+
+
 def so3_exp(rotation_vectors_rad: Array) -> Array:
     """Rotation matrices (..., 3, 3) of rotation vectors (..., 3)."""
     return np.asarray(Rotation.from_rotvec(rotation_vectors_rad).as_matrix(), dtype=np.float64)

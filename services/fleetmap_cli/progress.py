@@ -1,0 +1,40 @@
+"""A progress bar on stderr for work that goes through stages."""
+
+from __future__ import annotations
+
+import sys
+from types import TracebackType
+
+from tqdm import tqdm
+
+
+class StageBar:
+    """Call it with stage, done and total; each stage gets a bar of its own."""
+
+    def __init__(self) -> None:
+        self._bar: tqdm[None] | None = None
+        self._stage = ""
+
+    def __enter__(self) -> StageBar:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._close(complete=kind is None)
+
+    def __call__(self, stage: str, done: int, total: int) -> None:
+        """Show that ``done`` of ``total`` steps of a stage are finished."""
+        if stage != self._stage or self._bar is None:
+            self._close(complete=True)
+            bar: tqdm[None] = tqdm(total=total, desc=stage, file=sys.stderr)
+            self._bar, self._stage = bar, stage
+        self._bar.update(done - self._bar.n)
+
+    def _close(self, complete: bool) -> None:
+        if self._bar is None:
+            return
+        if complete and self._bar.total:
+            self._bar.update(self._bar.total - self._bar.n)
+        self._bar.close()
+        self._bar = None

@@ -1,0 +1,116 @@
+"""``fleetmap map``: turn a survey drive into a map anchored in UTM; with --watch, as an agent."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+
+import click
+
+from fleetmap.manifest import Manifest
+from fleetmap.transport import DEFAULT_ENDPOINT
+from fleetmap_cli.mapping import DriveChoice, map_and_publish, map_recording
+from fleetmap_cli.options import XYZ
+from fleetmap_cli.watching import stop_on_signals, watch_folder
+from fleetmap_mapper.settings import GnssGroup, GnssMode, MapperSettings
+
+_PATH = click.Path(path_type=Path)
+_UNFIT = 3
+
+
+@click.command("map")
+@click.argument("recording", type=_PATH, required=False)
+@click.option("--output", type=_PATH, metavar="FOLDER", help="Write the map package here.")
+@click.option("--trajectory", type=_PATH, metavar="OUT.tum", help="Write the pose of every image (TUM text, UTM).")
+@click.option(
+    "--gnss",
+    type=click.Choice(["none", "final", "full"]),
+    default="full",
+    show_default=True,
+    help="How fixes shape the map: 'none' places plain SLAM with one Sim(3) at the end, 'final' adds the joint "
+    "adjustment at the end, 'full' also aligns while mapping.",
+)
+@click.option("--map-id", metavar="ID", help="The map's id in the catalogue.  [default: the output folder's name]")
+@click.option("--image-topic", metavar="TOPIC", help="Which camera, where the recording holds several.")
+@click.option("--gnss-topic", metavar="TOPIC", help="Which receiver, where the recording holds several.")
+@click.option(
+    "--antenna-offset",
+    type=XYZ,
+    help="Antenna from the camera centre in metres: forward, left, up; used where the recording does not say.",
+)
+@click.option("--seed", type=int, default=0, show_default=True, help="Of everything that draws at random.")
+@click.option("--force", is_flag=True, help="Replace an existing output.")
+@click.option("--watch", type=_PATH, metavar="DIR", help="Map and publish every drive dropped into this folder.")
+@click.option(
+    "--server", metavar="tcp/HOST:PORT", help=f"With --watch: where to publish.  [default: {DEFAULT_ENDPOINT}]"
+)
+@click.option("--poll-s", type=click.FloatRange(min=0.1), default=5.0, show_default=True, help="With --watch.")
+def map_(
+    recording: Path | None,
+    output: Path | None,
+    trajectory: Path | None,
+    gnss: GnssMode,
+    map_id: str | None,
+    image_topic: str | None,
+    gnss_topic: str | None,
+    antenna_offset: tuple[float, float, float] | None,
+    seed: int,
+    force: bool,
+    watch: Path | None,
+    server: str | None,
+    poll_s: float,
+) -> int:
+    """Turn the survey drive RECORDING (one camera, GNSS) into a visual map anchored in UTM.
+
+    Ends with exit code 3 if the map was written but its own quality check says it should not be published.
+
+    \b
+    Examples:
+      fleetmap map survey.mcap --output my_map --trajectory survey.tum
+      fleetmap map --watch drives --server tcp/127.0.0.1:7447
+    """
+    settings = MapperSettings(seed=seed, gnss=GnssGroup(mode=gnss))
+    choice = DriveChoice(image_topic, gnss_topic, antenna_offset)
+    if watch is not None:
+        if recording or output or trajectory or map_id or force:
+            raise click.UsageError(
+                "--watch names its maps after the drives; it takes no recording, output or map id"
+            )
+        run = functools.partial(
+            map_and_publish, server=server or DEFAULT_ENDPOINT, settings=settings, choice=choice
+        )
+        with stop_on_signals() as stop:
+            watch_folder(watch, run, poll_s=poll_s, stop=stop)
+        return 0
+    if recording is None or output is None:
+        raise click.UsageError("give a RECORDING and --output FOLDER, or --watch DIR")
+    if server is not None:
+        raise click.UsageError("--server goes with --watch; send a finished map with 'fleetmap publish'")
+    manifest = map_recording(
+        recording,
+        output,
+        settings=settings,
+        choice=choice,
+        map_id=map_id,
+        trajectory=trajectory,
+        force=force,
+    )
+    return _report(manifest, output)
+
+
+def _report(manifest: Manifest, output: Path) -> int:
+    quality = manifest.quality
+    residual = quality.gnss_residual_rms_m
+    click.echo(f"map:           {output} (id {manifest.map_id}, EPSG:{manifest.anchor.epsg})")
+    click.echo(f"images posed:  {quality.frames_posed} of {quality.frames_total}, {quality.length_m:.1f} m")
+    click.echo(f"keyframes:     {quality.keyframes}, landmarks {quality.landmarks}")
+    click.echo(f"reprojection:  {quality.reprojection_rms_px:.2f} px RMS")
+    if residual is not None:
+        click.echo(
+            f"GNSS residual: {residual:.3f} m RMS over {quality.gnss_fixes} fixes (--gnss {quality.gnss_mode})"
+        )
+    for warning in quality.warnings:
+        click.echo(f"warning: {warning}", err=True)
+    if not quality.publishable:
+        click.echo("warning: this map should not be published", err=True)
+    return 0 if quality.publishable else _UNFIT

@@ -1,0 +1,77 @@
+"""PlacedMap -> VisualMap: descriptors, viewing directions and everything a localizer will ask for."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.geodesy import UtmAnchor
+from fleetmap.vision.matching import medoid_descriptor
+from fleetmap.visual_map import Keyframes, Landmarks, Observations, VisualMap
+from fleetmap_mapper.georeferenced_map import PlacedMap
+from fleetmap_mapper.growing_map import GrowingMap
+
+Array = NDArray[np.float64]
+
+
+def build_visual_map(placed: PlacedMap, growing: GrowingMap, anchor: UtmAnchor) -> VisualMap:
+    """The finished map."""
+    octaves = np.array(
+        [
+            growing.keyframes[k].features.octaves[f]
+            for k, f in zip(placed.keyframe_index, placed.feature_index, strict=True)
+        ],
+        dtype=np.uint8,
+    )
+    return VisualMap(
+        anchor,
+        placed.map_from_vis,
+        placed.camera,
+        Keyframes(
+            placed.keyframe_stamps_ns,
+            np.array([p.rotation for p in placed.poses]),
+            np.array([p.translation_m for p in placed.poses]),
+        ),
+        _landmarks(placed, growing, octaves),
+        Observations(placed.keyframe_index, placed.point_index, placed.pixels.astype(np.float32), octaves),
+    )
+
+
+def _landmarks(placed: PlacedMap, growing: GrowingMap, octaves: NDArray[np.uint8]) -> Landmarks:
+    centres = np.array([p.translation_m for p in placed.poses])
+    rays = centres[placed.keyframe_index] - placed.points_m[placed.point_index]
+    distances = np.linalg.norm(rays, axis=1)
+    sums = np.zeros_like(placed.points_m)
+    np.add.at(sums, placed.point_index, rays / distances[:, None])
+    chosen = _medoid_observations(placed, growing)
+    descriptors = _descriptors(placed, growing, chosen)
+    return Landmarks(
+        placed.points_m,
+        descriptors,
+        (sums / np.linalg.norm(sums, axis=1)[:, None]).astype(np.float32),
+        octaves[chosen],
+        distances[chosen].astype(np.float32),
+    )
+
+
+def _medoid_observations(placed: PlacedMap, growing: GrowingMap) -> NDArray[np.int64]:
+    """For each point the observation (P,) whose descriptor has the least median distance to the track's others."""
+    order = np.argsort(placed.point_index, kind="stable")
+    starts = np.searchsorted(placed.point_index[order], np.arange(len(placed.points_m) + 1))
+    descriptors = _descriptors(placed, growing, order)
+    return np.array(
+        [order[a + medoid_descriptor(descriptors[a:b])] for a, b in itertools.pairwise(starts)],
+        dtype=np.int64,
+    )
+
+
+def _descriptors(placed: PlacedMap, growing: GrowingMap, observations: NDArray[np.int64]) -> NDArray[np.uint8]:
+    """Descriptors (n, 32) behind some observations (n,)."""
+    descriptors = np.empty((len(observations), 32), np.uint8)
+    keyframes, features = placed.keyframe_index[observations], placed.feature_index[observations]
+    for keyframe in np.unique(keyframes):
+        rows = keyframes == keyframe
+        descriptors[rows] = growing.keyframes[keyframe].features.descriptors[features[rows]]
+    return descriptors

@@ -1,0 +1,74 @@
+"""Survey drive in, georeferenced visual map and trajectory out. This is the whole method on one page."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.drive import Drive, Frame
+from fleetmap.geometry import Pose
+from fleetmap.manifest import Quality
+from fleetmap.trajectory import Trajectory
+from fleetmap.visual_map import VisualMap
+from fleetmap_mapper.alignment import GnssAligner
+from fleetmap_mapper.georeferenced_map import adjust_with_fixes, place, pose_frames, without_outliers
+from fleetmap_mapper.georeferencing import GnssTrack, georeference, gnss_track, path_at_fixes
+from fleetmap_mapper.map_building import build_visual_map
+from fleetmap_mapper.quality import assess
+from fleetmap_mapper.settings import MapperSettings
+from fleetmap_mapper.slam import PosedFrame, run_slam
+
+Progress = Callable[[str, int, int], None]  # stage, done, total
+
+
+@dataclass(frozen=True)
+class MappedDrive:
+    """What a survey drive became."""
+
+    visual_map: VisualMap
+    trajectory: Trajectory  # every posed image
+    quality: Quality
+
+
+def map_drive(drive: Drive, settings: MapperSettings, progress: Progress = lambda *_: None) -> MappedDrive:
+    """Turn a survey drive into a map anchored in UTM.
+
+    Raises:
+        DriveError: no GNSS, too little of it, or images that cannot be read or tracked.
+        CalibrationError: no usable camera model.
+    """
+    track = gnss_track(drive.gnss_fixes(), drive.antenna().position_in_cam_m)
+    aligner = GnssAligner(track, settings) if settings.gnss.mode == "full" else None
+    growing, posed = run_slam(_counted(drive, progress), drive.camera, settings, aligner)
+
+    progress("placing the map", 0, 1)
+    path = path_at_fixes(_stamps(posed), [p.vis_from_cam for p in posed], track)
+    placed = place(growing, georeference(path, track, settings.gnss.level_sigma_deg))
+    if settings.gnss.mode == "none":
+        placed = without_outliers(placed)
+    else:
+        placed = adjust_with_fixes(placed, growing, posed, track, settings.gnss.level_sigma_deg, progress)
+
+    frames = pose_frames(placed, growing, posed)
+    trajectory = _trajectory(posed, frames, track)
+    quality = assess(placed, trajectory, path_at_fixes(_stamps(posed), frames, track), track, drive, settings)
+    return MappedDrive(build_visual_map(placed, growing, track.anchor), trajectory, quality)
+
+
+def _counted(drive: Drive, progress: Progress) -> Iterator[Frame]:
+    for index, frame in enumerate(drive.frames()):
+        progress("tracking", index, drive.frame_count)
+        yield frame
+
+
+def _stamps(posed: list[PosedFrame]) -> NDArray[np.int64]:
+    return np.array([p.stamp_ns for p in posed], dtype=np.int64)
+
+
+def _trajectory(posed: list[PosedFrame], frames: list[Pose], track: GnssTrack) -> Trajectory:
+    positions = np.array([f.translation_m for f in frames])
+    rotations = np.array([f.rotation for f in frames])
+    return Trajectory(track.anchor.epsg, _stamps(posed), track.anchor.utm_from_map(positions), rotations)
