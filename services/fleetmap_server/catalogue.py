@@ -162,7 +162,14 @@ class Catalogue:
 
 
 def _meets(box: LonLatBox) -> tuple[str, tuple[float, ...]]:
-    """SQL that holds for bounding boxes that meet ``box``, and its values."""
+    """SQL that holds for bounding boxes that meet ``box``, and its values.
+
+    Two intervals of longitude meet if each begins before the other ends. If one of them crosses 180 degrees,
+    one of these is enough; if both do, they meet there.
+    """
     west, south, east, north = box
-    longitudes = "(west <= ? AND east >= ?)" if west <= east else "(west <= ? OR east >= ?)"
-    return f"{longitudes} AND south <= ? AND north >= ?", (east, west, north, south)
+    if west <= east:
+        longitudes = "iif(west <= east, west <= ?1 AND east >= ?2, west <= ?1 OR east >= ?2)"
+    else:
+        longitudes = "(west > east OR west <= ?1 OR east >= ?2)"
+    return f"{longitudes} AND south <= ?3 AND north >= ?4", (east, west, north, south)

@@ -6,17 +6,18 @@ import fcntl
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from functools import lru_cache
+from itertools import accumulate
 from pathlib import Path
 
 from fleetmap.catalogue import MapEntry, MapPage, search_box_lonlat
 from fleetmap.errors import MapPackageError, RunError, StorageError
-from fleetmap.manifest import MAX_MANIFEST_BYTES, Manifest, parse_manifest
+from fleetmap.manifest import MAX_MANIFEST_BYTES, Manifest, manifest_version, parse_manifest
 from fleetmap.transport.protocol import CHUNK_BYTES, BlobTicket, MissingBlob, UploadStatus
 from fleetmap_server.catalogue import Catalogue, LonLatBox
 from fleetmap_server.problems import IncompleteUploadError, NotFoundError
 from fleetmap_server.store import BlobStore, storage_error
 
-_MAPS_PER_PAGE = 50
+_MAPS_PER_PAGE, _PAGE_BYTES = 50, 1024 * 1024
 _MISSING_PER_ANSWER = 2000
 _RESERVE_BYTES = 32 * 1024 * 1024  # left on the disk for the catalogue
 
@@ -184,13 +185,21 @@ def _only_server(folder: Path) -> Iterator[None]:
 
 
 def _page(found: list[MapEntry], offset: int) -> MapPage:
-    """Up to a page of entries; one more of them says that there is a next page."""
-    more = len(found) > _MAPS_PER_PAGE
-    return MapPage(maps=tuple(found[:_MAPS_PER_PAGE]), next_offset=offset + _MAPS_PER_PAGE if more else None)
+    """As many entries as one message may hold; where some are left over there is a next page."""
+    ends = accumulate(len(entry.model_dump_json()) for entry in found)
+    fitting = max(sum(end <= _PAGE_BYTES for end in ends), 1)
+    page = tuple(found[: min(fitting, _MAPS_PER_PAGE)])
+    return MapPage(maps=page, next_offset=offset + len(page) if len(found) > len(page) else None)
 
 
 def _check_manifest(data: bytes) -> None:
-    parse_manifest(data, "the map sent")
+    """Refuse what is no manifest, or would make an entry that no page of the catalogue can hold."""
+    manifest = parse_manifest(data, "the map sent")
+    entry = MapEntry.from_manifest(manifest, manifest_version(data), len(data), published_ns=0)
+    if len(entry.model_dump_json()) > _PAGE_BYTES:
+        raise MapPackageError(
+            f"the trajectory and warnings of map '{manifest.map_id}' are too long for a catalogue; thin them out"
+        )
 
 
 def _check_manifest_size(size_bytes: int) -> None:

@@ -9,7 +9,7 @@ from types import TracebackType
 from typing import Self
 
 from fleetmap.catalogue import NEAR_RADIUS_M, MapEntry, MapPage
-from fleetmap.errors import MapPackageError, TransferError
+from fleetmap.errors import InputError, MapPackageError, TransferError
 from fleetmap.manifest import MAX_MANIFEST_BYTES, manifest_version, parse_manifest
 from fleetmap.transport import protocol
 from fleetmap.transport.link import Parameters, PendingRequest, ServerLink
@@ -74,9 +74,15 @@ class MapClient:
 
         With ``near`` (latitude, longitude in degrees) only the maps whose trajectory passes within
         ``radius_m`` of it, nearest first.
+
+        Raises:
+            InputError: there is no such place on the globe.
+            ServerError: the server refused, or answers no more.
         """
         where: Parameters = {}
         if near is not None:
+            if not (abs(near[0]) <= 90.0 and abs(near[1]) <= 180.0):
+                raise InputError(f"latitude {near[0]}, longitude {near[1]} is no place on the globe")
             where = {"lat_deg": near[0], "lon_deg": near[1], "radius_m": radius_m}
         maps: list[MapEntry] = []
         offset: int | None = 0

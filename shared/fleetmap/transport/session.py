@@ -118,6 +118,8 @@ def _config(settings: Mapping[str, Any]) -> zenoh.Config:
     common = {
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
+        # Between processes of one machine Zenoh would go around TCP, and a killed one leave its segments behind.
+        "transport/shared_memory/enabled": False,
         "transport/link/tx/queue/congestion_control/block/wait_before_close": _PATIENCE_OF_LINK_US,
         "transport/link/rx/max_message_size": _MAX_MESSAGE_BYTES,
     }
