@@ -14,10 +14,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap.errors import InputError
 from fleetmap.simulation.surfaces import GreyImage, Texture
 
 MAX_LEVEL = 6  # sides are multiples of 2**6
-_WIDTH_PX = 8192
+_WIDTH_PX = 16384
 _MAX_HEIGHT_PX = 32000  # cv2.remap addresses pixels with 16 bits
 
 
@@ -56,8 +57,9 @@ def _shelves(sizes: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
         origins[index] = x, y
         x += width
     if y + shelf_height > _MAX_HEIGHT_PX:
-        raise ValueError(
-            f"the textures need {y + shelf_height} rows, more than {_MAX_HEIGHT_PX}; shorten the street"
+        raise InputError(
+            f"the street's textures need {y + shelf_height} rows of {_WIDTH_PX} pixels, "
+            f"more than {_MAX_HEIGHT_PX}; build a shorter street"
         )
     return origins, y + shelf_height
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap.errors import InputError
 from fleetmap.geometry import so3_exp
 from fleetmap.simulation.street import Street
 from fleetmap.trajectory import Trajectory
@@ -36,9 +37,14 @@ def drive_along(
 
     ``lane_offset_m`` is to the left of the right-hand lane's centre (3.5: the other lane); ``start_m`` and
     ``end_m`` count along the street's path, to its end by default. The camera looks along the path, x right,
-    y down, z forward, and sways a little as a car does.
+    y down, z forward, and sways a little as a car does. Metres are those of the UTM grid.
+
+    Raises:
+        InputError: a speed or rate that is not positive, or a stretch that ends before it starts.
     """
     stop_m = street.length_m if end_m is None else end_m
+    if not (speed_mps > 0.0 and rate_hz > 0.0 and start_m < stop_m):
+        raise InputError(f"cannot drive from {start_m} m to {stop_m} m at {speed_mps} m/s with {rate_hz} images/s")
     s_fine = np.arange(start_m, stop_m + 0.05, 0.05)
     travelled_m = _arc_length(street.path.at(s_fine, lane_offset_m))
     seconds = np.arange(0.0, travelled_m[-1] / speed_mps, 1.0 / rate_hz)

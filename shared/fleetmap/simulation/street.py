@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap.errors import InputError
 from fleetmap.geodesy import UtmAnchor, UtmGrid
 from fleetmap.simulation import furniture, houses, textures
 from fleetmap.simulation.atlas import Atlas, build_atlas
@@ -28,6 +29,7 @@ _PAVEMENT_M, _KERB_HEIGHT_M = 2.4, 0.12
 _GARDEN_M = 13.0
 _BEFORE_M, _AFTER_M = 12.0, 90.0  # built before the start and after the end, so that the view never ends early
 _HORIZON_M = 220.0
+_SHORTEST_M, _LONGEST_M = 10.0, 500.0  # beyond it, textures need hundreds of megabytes
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,13 @@ def build_street(
     lon_deg: float = 11.43,
     height_m: float = 420.0,
 ) -> Street:
-    """Build the street of a seed at a site (ellipsoidal height). Equal arguments give equal streets."""
+    """Build the street of a seed at a site (ellipsoidal height). Equal arguments give equal streets.
+
+    Raises:
+        InputError: a length that is too small or too large for its textures, or a site outside UTM.
+    """
+    if not _SHORTEST_M <= length_m <= _LONGEST_M:
+        raise InputError(f"a street of {length_m} m cannot be built; give {_SHORTEST_M:.0f} to {_LONGEST_M:.0f} m")
     path_rng, ground_rng, house_rng, furniture_rng, far_rng = np.random.default_rng(seed).spawn(5)
     path = build_path(path_rng, length_m, _BEFORE_M, _AFTER_M)
     sun_azimuth, sun_elevation = path_rng.uniform(0.0, 2.0 * np.pi), np.radians(path_rng.uniform(30.0, 50.0))

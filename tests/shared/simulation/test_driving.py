@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from fleetmap.errors import InputError
 from fleetmap.geometry import rotation_angle_rad
 from fleetmap.simulation.driving import START_NS, drive_along
 from fleetmap.simulation.street import Street
@@ -61,3 +62,9 @@ def test_the_street_bends_and_climbs(street: Street) -> None:
     headings_rad = np.unwrap(np.arctan2(forward[:, 1], forward[:, 0]))
     assert np.degrees(np.ptp(headings_rad)) > 20.0
     assert 0.05 < np.ptp(street.path.positions_m[:, 2]) < 5.0
+
+
+@pytest.mark.parametrize("nonsense", [{"speed_mps": 0.0}, {"rate_hz": -1.0}, {"start_m": 30.0, "end_m": 20.0}])
+def test_a_drive_that_makes_no_sense_is_refused(street: Street, nonsense: dict[str, float]) -> None:
+    with pytest.raises(InputError, match="cannot drive from"):
+        drive_along(street, **nonsense)

@@ -8,6 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from fleetmap.camera import Camera
+from fleetmap.errors import InputError
 from fleetmap.geodesy import UtmGrid
 from fleetmap.geometry import Pose
 from fleetmap.simulation.driving import drive_along
@@ -24,7 +25,7 @@ def drive(street: Street) -> SimulatedDrive:
 
 
 def test_the_same_seed_builds_the_same_street_and_another_seed_another(street: Street) -> None:
-    again, other = build_street(5, 40.0), build_street(6, 40.0)
+    again, other = build_street(5, 40.0), build_street(6, 20.0)
     assert street.surfaces.corners_in_map.tobytes() == again.surfaces.corners_in_map.tobytes()
     assert np.array_equal(street.atlas.pixels, again.atlas.pixels)
     assert street.surfaces.corners_in_map.tobytes() != other.surfaces.corners_in_map.tobytes()
@@ -85,3 +86,9 @@ def _features(orb: cv2.ORB, image: NDArray[np.uint8]) -> tuple[NDArray[np.float6
 
 def _cam_from_map(drive: SimulatedDrive, index: int) -> Pose:
     return drive.map_from_cam(index).inverse()
+
+
+@pytest.mark.parametrize("length_m", [0.0, -5.0, float("nan"), 5000.0])
+def test_a_street_of_impossible_length_is_refused(length_m: float) -> None:
+    with pytest.raises(InputError, match="street"):
+        build_street(1, length_m)
