@@ -127,27 +127,13 @@ def record_drive(
 ) -> Path:
     """Write a simulated drive as MCAP, and its truth beside it: ``survey.mcap``, ``survey.reference.tum``.
 
-    The truth never enters the recording. See :func:`simulate_drive` for the other arguments.
-
-    Args:
-        street: where.
-        path: the recording.
-        camera: with what.
-        trajectory: the camera's true poses.
-        look: what lens and sensor make of the light.
-        gnss: "rtk", "consumer" or None.
-        gnss_interval_s: seconds between fixes.
-        gnss_gap_s: a stretch without fixes.
-        antenna_in_cam_m: the antenna in the camera's frame.
-        seed: of the fixes' errors.
-        force: replace an existing recording.
-        progress: show a progress bar on stderr.
+    The truth never enters the recording. ``force`` replaces an existing recording, ``progress`` shows a bar on
+    stderr; the other arguments and errors are those of :func:`simulate_drive`.
 
     Returns:
         The path of the reference.
 
     Raises:
-        InputError: see :func:`simulate_drive`.
         OutputExistsError: the recording is there already and ``force`` is not given.
         StorageError: the disk is full or refuses.
     """
@@ -163,18 +149,21 @@ def record_drive(
         seed=seed,
     )
     with DriveWriter(path, camera, force=force, camera_frame_id=_CAMERA_FRAME_ID) as writer:
-        fix_frame_id = _CAMERA_FRAME_ID
-        if any(antenna_in_cam_m):
-            fix_frame_id = _ANTENNA_FRAME_ID
-            mounting = Pose(np.eye(3), np.array(antenna_in_cam_m, dtype=np.float64))
-            writer.write_static_transform(_CAMERA_FRAME_ID, _ANTENNA_FRAME_ID, mounting)
-        for fix in drive.fixes:
-            writer.write_fix(fix, fix_frame_id)
-        frames = tqdm(
-            drive.frames(), total=drive.frame_count, desc=f"render {path.name}", unit="image", disable=not progress
-        )
-        for frame in frames:
+        _write_fixes(writer, drive)
+        label = f"render {path.name}"
+        for frame in tqdm(drive.frames(), label, drive.frame_count, unit="image", disable=not progress):
             writer.write_image(frame.stamp_ns, frame.image)
     reference = path.with_name(f"{path.stem}.reference.tum")
     write_trajectory(reference, trajectory)
     return reference
+
+
+def _write_fixes(writer: DriveWriter, drive: SimulatedDrive) -> None:
+    """Fixes in the camera's own frame, or in the antenna's with a static transform to it."""
+    frame_id = _CAMERA_FRAME_ID
+    if any(drive.antenna_in_cam_m):
+        frame_id = _ANTENNA_FRAME_ID
+        mounting = Pose(np.eye(3), np.array(drive.antenna_in_cam_m, dtype=np.float64))
+        writer.write_static_transform(_CAMERA_FRAME_ID, _ANTENNA_FRAME_ID, mounting)
+    for fix in drive.fixes:
+        writer.write_fix(fix, frame_id)

@@ -60,16 +60,7 @@ def build_street(
         raise InputError(f"a street of {length_m} m cannot be built; give {_SHORTEST_M:.0f} to {_LONGEST_M:.0f} m")
     path_rng, ground_rng, house_rng, furniture_rng, far_rng = np.random.default_rng(seed).spawn(5)
     path = build_path(path_rng, length_m, _BEFORE_M, _AFTER_M)
-    sun_azimuth, sun_elevation = path_rng.uniform(0.0, 2.0 * np.pi), np.radians(path_rng.uniform(30.0, 50.0))
-    builder = SurfaceBuilder(
-        np.array(
-            [
-                np.cos(sun_azimuth) * np.cos(sun_elevation),
-                np.sin(sun_azimuth) * np.cos(sun_elevation),
-                np.sin(sun_elevation),
-            ]
-        )
-    )
+    builder = SurfaceBuilder(_sun(path_rng))
     span = np.array([-_BEFORE_M, length_m + _AFTER_M - 25.0])
     _lay_ground(ground_rng, builder, path)
     houses.build_row(house_rng, builder, path, -1.0, _PAVEMENT_M - _RIGHT_KERB_M, span)
@@ -84,6 +75,13 @@ def build_street(
     easting, northing, _ = utm.from_geodetic(np.array(lat_deg), np.array(lon_deg), np.array(height_m))
     anchor = UtmAnchor(utm.epsg, round(float(easting)), round(float(northing)), round(height_m))
     return Street(anchor, length_m, path, builder.surfaces(), build_atlas(builder.textures))
+
+
+def _sun(rng: Rng) -> Array:
+    """Unit vector (3,) towards the sun, in the map frame."""
+    azimuth, elevation = rng.uniform(0.0, 2.0 * np.pi), np.radians(rng.uniform(30.0, 50.0))
+    across, up = np.cos(elevation), np.sin(elevation)
+    return np.array([np.cos(azimuth) * across, np.sin(azimuth) * across, up])
 
 
 def _lay_ground(rng: Rng, builder: SurfaceBuilder, path: StreetPath) -> None:
