@@ -168,3 +168,8 @@ def start_server() -> Iterator[Callable[[Path, str], ServerProcess]]:
     for server in started:
         with contextlib.suppress(Exception):
             server.kill()
+
+
+@pytest.fixture(scope="module")
+def module_endpoint() -> str:
+    return f"tcp/127.0.0.1:{free_port()}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import resource
 import socket
@@ -76,10 +77,8 @@ class CuttingProxy:
 
     def cut(self, *connections: socket.socket) -> None:
         for connection in connections or self.connections:
-            try:
+            with contextlib.suppress(OSError):
                 connection.shutdown(socket.SHUT_RDWR)
-            except OSError:
-                pass
             connection.close()
 
     def close(self) -> None:
@@ -198,7 +197,7 @@ def test_a_full_disk_is_told_and_the_upload_goes_on_once_there_is_room(start_ser
     _, hard = resource.prlimit(server.process.pid, resource.RLIMIT_FSIZE)
     resource.prlimit(server.process.pid, resource.RLIMIT_FSIZE, (CUT_BYTES, hard))
     with MapClient(endpoint) as client:
-        with pytest.raises(StorageError, match="cannot write .*: File too large; free some space"):
+        with pytest.raises(StorageError, match=r"cannot write .*: File too large; free some space"):
             client.publish(original.manifest_bytes, original.parts.__getitem__)
         assert client.list_maps() == []
         assert items(server.http_url) == []

@@ -142,7 +142,7 @@ def test_a_part_that_is_not_what_the_manifest_says_is_not_sent(server, make_map)
     original = make_map()
     tampered = {sha256: data[:-1] + b"?" for sha256, data in original.parts.items()}
     with MapClient(server.zenoh_endpoint) as client:
-        with pytest.raises(MapPackageError, match="part .* of map 'karlsruhe' is not what its manifest names"):
+        with pytest.raises(MapPackageError, match=r"part .* of map 'karlsruhe' is not what its manifest names"):
             client.publish(original.manifest_bytes, tampered.__getitem__)
         assert client.list_maps() == []
 

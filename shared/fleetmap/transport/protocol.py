@@ -44,7 +44,7 @@ PROBLEM_ENCODING = "application/problem+json"
 HELLO, MAPS, MANIFEST, CHUNK = "hello", "maps", "manifest", "chunk"
 UPLOAD_BEGIN, UPLOAD_CHUNK, UPLOAD_COMMIT = "upload/begin", "upload/chunk", "upload/commit"
 
-_ENDPOINT = re.compile(r"^tcp/(?P<host>\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+):(?P<port>[0-9]{1,5})$")
+_ENDPOINT = re.compile(r"tcp/(?P<host>\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+):(?P<port>[0-9]{1,5})")
 
 
 class _Message(BaseModel):
@@ -153,7 +153,7 @@ def check_endpoint(text: str) -> str:
     Raises:
         InputError: not of the form ``tcp/HOST:PORT``.
     """
-    match = _ENDPOINT.match(text)
+    match = _ENDPOINT.fullmatch(text)
     if match is None or not 0 < int(match["port"]) < 65536:
-        raise InputError(f"'{text}' is no Zenoh endpoint; write tcp/HOST:PORT, for instance {DEFAULT_ENDPOINT}")
+        raise InputError(f"{text!r} is no Zenoh endpoint; write tcp/HOST:PORT, for instance {DEFAULT_ENDPOINT}")
     return text
