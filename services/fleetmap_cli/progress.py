@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from types import TracebackType
+from typing import Any
 
 from tqdm import tqdm
 
@@ -12,7 +13,7 @@ class StageBar:
     """Call it with stage, done and total; each stage gets a bar of its own."""
 
     def __init__(self) -> None:
-        self._bar: tqdm[None] | None = None
+        self._bar: tqdm[Any] | None = None
         self._stage = ""
 
     def __enter__(self) -> StageBar:
@@ -27,7 +28,7 @@ class StageBar:
         """Show that ``done`` of ``total`` steps of a stage are finished."""
         if stage != self._stage or self._bar is None:
             self._close(complete=True)
-            bar: tqdm[None] = tqdm(total=total, desc=stage, file=sys.stderr)
+            bar: tqdm[Any] = tqdm(total=total, desc=stage, file=sys.stderr)
             self._bar, self._stage = bar, stage
         self._bar.update(done - self._bar.n)
 

@@ -60,7 +60,7 @@ class GnssGroup(_Group):
 
     mode: GnssMode = "full"
     align_every: int = 5  # keyframes between two light alignments while mapping
-    level_sigma_deg: float = 2.0  # how level the camera's horizontal axis is on average over a drive
+    level_sigma_deg: float = 0.5  # how level the camera's horizontal axis is taken to be, averaged over a drive
 
 
 class QualityGroup(_Group):
