@@ -28,7 +28,7 @@ class PlacedMap:
     """Keyframes, points and observations in the map frame, as flat arrays."""
 
     camera: Camera
-    map_from_vis: Sim3
+    map_from_vis: Sim3  # from the frame of the growing map it was placed from
     keyframe_stamps_ns: NDArray[np.int64]  # (K,)
     poses: list[Pose]  # K map_from_cam
     landmark_ids: NDArray[np.int32]  # (P,) ids in the growing map, sorted

@@ -19,6 +19,18 @@ Array = NDArray[np.float64]
 Ids = NDArray[np.int32]
 
 SCALE_FACTOR = 1.2
+_LANDMARK_ARRAYS = (
+    "points",
+    "normals",
+    "descriptors",
+    "octaves",
+    "distances",
+    "reference",
+    "visible",
+    "found",
+    "alive",
+    "merged_into",
+)
 
 
 @dataclass
@@ -70,8 +82,7 @@ class GrowingMap:
     ) -> Ids:
         """Append landmarks (n, 3) seen by two keyframes; ``second`` is the newer and becomes their reference."""
         ids = np.arange(self.landmark_count, self.landmark_count + len(points), dtype=np.int32)
-        while self.landmark_count + len(points) > len(self.points):
-            self._double()
+        self.reserve(self.landmark_count + len(points))
         self.landmark_count += len(points)
         self.points[ids] = points
         self.alive[ids] = True
@@ -165,21 +176,15 @@ class GrowingMap:
             counts[keyframe.landmarks()] += 1
         return counts
 
-    def _double(self) -> None:
-        for name in (
-            "points",
-            "normals",
-            "descriptors",
-            "octaves",
-            "distances",
-            "reference",
-            "visible",
-            "found",
-            "alive",
-            "merged_into",
-        ):
+    def reserve(self, count: int) -> None:
+        """Make room for so many landmarks."""
+        missing = count - len(self.points)
+        if missing <= 0:
+            return
+        more = max(missing, len(self.points))
+        for name in _LANDMARK_ARRAYS:
             array = getattr(self, name)
-            setattr(self, name, np.concatenate([array, np.zeros_like(array)]))
+            setattr(self, name, np.concatenate([array, np.zeros((more, *array.shape[1:]), array.dtype)]))
 
 
 def _end(target: Ids, index: int) -> int:

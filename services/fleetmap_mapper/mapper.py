@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.drive import Drive, Frame
-from fleetmap.geometry import Pose
+from fleetmap.errors import DriveError
+from fleetmap.geometry import Pose, Sim3
 from fleetmap.manifest import Quality
 from fleetmap.trajectory import Trajectory
 from fleetmap.visual_map import VisualMap
@@ -18,8 +19,9 @@ from fleetmap_mapper.georeferenced_map import adjust_with_fixes, place, pose_fra
 from fleetmap_mapper.georeferencing import GnssTrack, georeference, gnss_track, path_at_fixes
 from fleetmap_mapper.map_building import build_visual_map
 from fleetmap_mapper.quality import assess
+from fleetmap_mapper.segments import join_segments
 from fleetmap_mapper.settings import MapperSettings
-from fleetmap_mapper.slam import PosedFrame, run_slam
+from fleetmap_mapper.slam import PosedFrame, Segment, run_slam
 
 Progress = Callable[[str, int, int], None]  # stage, done, total
 
@@ -42,20 +44,42 @@ def map_drive(drive: Drive, settings: MapperSettings, progress: Progress = lambd
     """
     track = gnss_track(drive.gnss_fixes(), drive.antenna().position_in_cam_m)
     aligner = GnssAligner(track, settings) if settings.gnss.mode == "full" else None
-    growing, posed = run_slam(_counted(drive, progress), drive.camera, settings, aligner)
+    segments = run_slam(_counted(drive, progress), drive.camera, settings, aligner)
 
     progress("placing the map", 0, 1)
-    path = path_at_fixes(_stamps(posed), [p.vis_from_cam for p in posed], track)
-    placed = place(growing, georeference(path, track, settings.gnss.level_sigma_deg))
+    joined, map_from_vis = _placed_segments(segments, track, settings)
+    growing, posed = joined.growing, joined.posed
+    placed = place(growing, Sim3.identity())
     if settings.gnss.mode == "none":
         placed = without_outliers(placed)
     else:
         placed = adjust_with_fixes(placed, growing, posed, track, settings.gnss.level_sigma_deg, progress)
+    placed = replace(placed, map_from_vis=placed.map_from_vis @ map_from_vis)
 
     frames = pose_frames(placed, growing, posed)
     trajectory = _trajectory(posed, frames, track)
     quality = assess(placed, trajectory, path_at_fixes(_stamps(posed), frames, track), track, drive, settings)
     return MappedDrive(build_visual_map(placed, growing, track.anchor), trajectory, quality)
+
+
+def _placed_segments(
+    segments: Sequence[Segment], track: GnssTrack, settings: MapperSettings
+) -> tuple[Segment, Sim3]:
+    """All segments that their fixes determine, joined in the map frame; and S of the first of them.
+
+    Raises:
+        DriveError: not one segment can be placed.
+    """
+    placeable, refusals = [], []
+    for segment in segments:
+        path = path_at_fixes(_stamps(segment.posed), [p.vis_from_cam for p in segment.posed], track)
+        try:
+            placeable.append((segment, georeference(path, track, settings.gnss.level_sigma_deg)))
+        except DriveError as error:
+            refusals.append(error)
+    if not placeable:
+        raise refusals[0]
+    return join_segments([s for s, _ in placeable], [S for _, S in placeable]), placeable[0][1]
 
 
 def _counted(drive: Drive, progress: Progress) -> Iterator[Frame]:

@@ -35,6 +35,7 @@ class TrackingGroup(_Group):
     max_hamming: int = 80
     match_ratio: float = 0.9
     local_keyframes: int = 25
+    patience_frames: int = 10  # lost for so long, a new segment is tried beside the old map
 
 
 class KeyframeGroup(_Group):
@@ -69,7 +70,7 @@ class QualityGroup(_Group):
     min_posed_ratio: float = 0.95
     max_reprojection_rms_px: float = 2.0
     max_gnss_residual_sigmas: float = 4.0  # RMS of the residuals over their own sigma
-    max_unposed_gap_s: float = 2.0
+    max_unposed_gap_s: float = 5.0
 
 
 class MapperSettings(_Group):

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from fleetmap.camera import Camera
 from fleetmap.drive import Frame
-from fleetmap.errors import MappingError
+from fleetmap.errors import DriveError
 from fleetmap.geometry import Pose, interpolate_pose, rotation_angle_rad
 from fleetmap.vision.features import FeatureExtractor, Features, FeatureSettings
 from fleetmap_mapper.growing_map import GrowingMap, Ids, Keyframe
@@ -55,6 +55,14 @@ class Unposed:
     features: Features
 
 
+@dataclass(frozen=True)
+class Segment:
+    """A stretch of the drive with a map of its own, in a ``vis`` frame of its own."""
+
+    growing: GrowingMap
+    posed: list[PosedFrame]  # in time order
+
+
 OnKeyframe = Callable[[GrowingMap, list[PosedFrame]], None]
 
 
@@ -64,6 +72,7 @@ class Slam:
     def __init__(self, camera: Camera, settings: MapperSettings, on_keyframe: OnKeyframe | None = None) -> None:
         self.growing = GrowingMap(camera)
         self.posed: dict[int, PosedFrame] = {}
+        self.lost: list[Unposed] = []  # frames since tracking was lost
         self._settings = settings
         self._on_keyframe = on_keyframe
         self._waiting: list[Unposed] = []
@@ -73,6 +82,11 @@ class Slam:
         self._before_last: PosedFrame | None = None
         self._tracked_at_keyframe = 0
 
+    @property
+    def is_established(self) -> bool:
+        """Whether the map has outgrown the suspicion that its first two views misled."""
+        return len(self.growing.keyframes) >= _YOUNG_MAP_KEYFRAMES
+
     def register_frame(self, frame: Unposed) -> None:
         """Pose one frame; while there is no map, try to make one."""
         if not self.growing.keyframes:
@@ -81,24 +95,18 @@ class Slam:
         tracked = self._track(frame)
         if tracked is None:
             self._waiting.append(frame)
-            if len(self.growing.keyframes) < _YOUNG_MAP_KEYFRAMES:
+            self.lost.append(frame)
+            if not self.is_established:
                 self._start_again(frame)
             return
+        self.lost.clear()
         if self._is_keyframe(tracked):
             self._insert_keyframe(frame, tracked)
         else:
             self._remember(frame, tracked, self.growing.keyframes[-1])
 
     def finish(self) -> list[PosedFrame]:
-        """Pose the frames that were left waiting; returns all posed frames in time order.
-
-        Raises:
-            MappingError: no two views ever made a map.
-        """
-        if not self.growing.keyframes:
-            raise MappingError(
-                "no map could be started: the images show too little texture or the camera did not move"
-            )
+        """Pose the frames that were left waiting; returns all posed frames in time order."""
         self._pose_waiting_frames()
         return [self.posed[index] for index in sorted(self.posed)]
 
@@ -165,10 +173,10 @@ class Slam:
         )
         self.posed[frame.frame_index] = posed
         self._before_last, self._last = self._last, posed
-        if len(self.growing.keyframes) < _YOUNG_MAP_KEYFRAMES:
-            self._young.append(frame)
-        else:
+        if self.is_established:
             self._young.clear()
+        else:
+            self._young.append(frame)
 
     def _is_keyframe(self, tracked: Tracked) -> bool:
         settings, last = self._settings.keyframes, self.growing.keyframes[-1]
@@ -204,6 +212,7 @@ class Slam:
         self.growing = GrowingMap(self.growing.camera)
         self.posed.clear()
         self._young.clear()
+        self.lost.clear()
         self._first, self._last, self._before_last = frame, None, None
 
     def _pose_waiting_frames(self) -> None:
@@ -225,14 +234,37 @@ def run_slam(
     camera: Camera,
     settings: MapperSettings,
     on_keyframe: OnKeyframe | None = None,
-) -> tuple[GrowingMap, list[PosedFrame]]:
-    """Feed a whole drive through SLAM."""
+) -> list[Segment]:
+    """Feed a whole drive through SLAM; where tracking is lost for good, a new segment begins.
+
+    Raises:
+        DriveError: no two images of the drive ever made a map.
+    """
     extractor = FeatureExtractor(camera, FeatureSettings(count=settings.features.count))
-    slam = Slam(camera, settings, on_keyframe)
+    current, successor = Slam(camera, settings, on_keyframe), None
+    segments = []
     for index, frame in enumerate(frames):
-        slam.register_frame(Unposed(index, frame.stamp_ns, extractor.extract(frame.image)))
-    posed = slam.finish()
-    return slam.growing, posed
+        unposed = Unposed(index, frame.stamp_ns, extractor.extract(frame.image))
+        current.register_frame(unposed)
+        if len(current.lost) < settings.tracking.patience_frames:
+            successor = None
+            continue
+        if successor is None:
+            successor = Slam(camera, settings, on_keyframe)
+            for earlier in current.lost[:-1]:
+                successor.register_frame(earlier)
+        successor.register_frame(unposed)
+        if successor.is_established:
+            segments.append(Segment(current.growing, current.finish()))
+            current, successor = successor, None
+    segments.append(Segment(current.growing, current.finish()))
+    segments = [segment for segment in segments if segment.posed]
+    if not segments:
+        raise DriveError(
+            "no map could be started: the images show too little texture, or the camera never moved; "
+            "look at them, and at their exposure"
+        )
+    return segments
 
 
 def _none(features: Features) -> Ids:

@@ -49,6 +49,11 @@ class Sim3:
     rotation: Array  # (3, 3) float64
     translation_m: Array  # (3,) float64
 
+    @staticmethod
+    def identity() -> Sim3:
+        """The transform that changes nothing."""
+        return Sim3(1.0, np.eye(3), np.zeros(3))
+
     def __matmul__(self, other: Sim3) -> Sim3:
         return Sim3(
             self.scale * other.scale,
