@@ -16,7 +16,7 @@ def triangulate(camera: Camera, world_from_a: Pose, pixels_a: Array, world_from_
     """Midpoints (N, 3) of the shortest segments between the viewing rays of undistorted pixels (N, 2).
 
     Source: Hartley & Sturm, "Triangulation", CVIU 1997, section 5.1; bundle adjustment refines them.
-    Parallel rays give points that are not finite.
+    Parallel rays give no point: not a finite one, or one that neither pixel believes.
     """
     rays_a, rays_b = _rays(camera, world_from_a, pixels_a), _rays(camera, world_from_b, pixels_b)
     baseline = world_from_b.translation_m - world_from_a.translation_m
