@@ -1,50 +1,90 @@
-"""Whether a pose is worth reporting: no pose rather than a wrong one."""
+"""Whether a pose is worth reporting: no pose rather than a wrong one.
+
+Houses, cars and windows repeat. A copy of one of them at the wrong place can gather a hundred consistent matches;
+but it gathers them in one part of the image, while elsewhere the map's landmarks are not where the pose says.
+So it counts how much of the view agrees, beside how many landmarks do.
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.camera import Camera
+from fleetmap.geometry import Pose, rotation_angle_rad
 from fleetmap.vision.absolute_pose import AbsolutePose
 from fleetmap_localizer.settings import GateSettings
 
+Array = NDArray[np.float64]
+
 _COLUMNS, _ROWS = 8, 4
+_POPULATED = 5  # landmarks and features that a cell must have for its silence to mean something
+_MIN_POPULATED_CELLS = 4
+_SAME_PLACE_M, _SAME_VIEW_RAD = 1.0, np.radians(5.0)
 
 
-def is_trustworthy(
-    answer: AbsolutePose,
-    pixels: NDArray[np.float64],
-    landmarks_in_view: int,
-    min_inliers: int,
-    camera: Camera,
-    settings: GateSettings,
-) -> bool:
-    """Judge a pose by how many landmarks agree, how many should have, where they lie and how firmly they hold it.
+@dataclass(frozen=True)
+class Fit:
+    """A pose with all that speaks for and against it; pixels are undistorted."""
 
-    Args:
-        answer: the pose fitted to P matches.
-        pixels: (P, 2) of the matches.
-        landmarks_in_view: how many landmarks the camera should see from this pose.
-        min_inliers: the least number to agree.
-        camera: whose image it is.
-        settings: the other limits.
-    """
-    inliers = answer.inlier_count
+    answer: AbsolutePose
+    matched_px: Array  # (P, 2) features that the pose was fitted to
+    predicted_px: Array  # (L, 2) where the landmarks in view should be
+    feature_px: Array  # (F, 2) all features of the image
+
+
+def is_trustworthy(fit: Fit, camera: Camera, settings: GateSettings) -> bool:
+    """Judge by how many landmarks agree, how much of the view they fill, and how firmly they hold the pose."""
+    answer = fit.answer
+    agreeing = _per_cell(fit.matched_px[answer.inliers], camera)
     position_sigma_m = np.sqrt(np.linalg.eigvalsh(answer.covariance[3:, 3:])[-1])
     rotation_sigma_deg = np.degrees(np.sqrt(np.linalg.eigvalsh(answer.covariance[:3, :3])[-1]))
     return bool(
-        inliers >= min_inliers
-        and inliers >= settings.min_inlier_ratio * len(pixels)
-        and inliers >= settings.min_seen_ratio * landmarks_in_view
-        and _occupied_cells(pixels[answer.inliers], camera) >= settings.min_occupied_cells
+        answer.inlier_count >= settings.min_inliers
+        and answer.inlier_count >= settings.min_inlier_ratio * len(fit.matched_px)
+        and np.count_nonzero(agreeing) >= settings.min_occupied_cells
+        and _coverage(fit, agreeing, camera) >= settings.min_coverage
         and position_sigma_m <= settings.max_position_sigma_m
         and rotation_sigma_deg <= settings.max_rotation_sigma_deg
     )
 
 
-def _occupied_cells(pixels: NDArray[np.float64], camera: Camera) -> int:
-    """Cells of a coarse grid over the image that hold a point."""
+def best_unrivalled(fits: list[Fit], max_rival: float) -> Fit | None:
+    """The fit with the most inliers; None where another place explains the image almost as well.
+
+    ``max_rival`` is the share of the best's inliers from which on a fit at another place is a rival.
+    """
+    if not fits:
+        return None
+    best = max(fits, key=lambda fit: fit.answer.inlier_count)
+    limit = max_rival * best.answer.inlier_count
+    rivals = [
+        fit
+        for fit in fits
+        if fit.answer.inlier_count >= limit and _differ(fit.answer.map_from_cam, best.answer.map_from_cam)
+    ]
+    return None if rivals else best
+
+
+def _coverage(fit: Fit, agreeing: NDArray[np.int64], camera: Camera) -> float:
+    """Of the cells where landmarks should be found, the share in which some are; 1 in a map too sparse to tell."""
+    promised = np.minimum(_per_cell(fit.predicted_px, camera), _per_cell(fit.feature_px, camera))
+    populated = promised >= _POPULATED
+    if np.count_nonzero(populated) < _MIN_POPULATED_CELLS:
+        return 1.0
+    return float(np.mean(agreeing[populated] > 0))
+
+
+def _per_cell(pixels: Array, camera: Camera) -> NDArray[np.int64]:
+    """How many of the pixels (N, 2) fall into each cell of a coarse grid over the image."""
     column = np.clip(pixels[:, 0] * _COLUMNS / camera.width_px, 0, _COLUMNS - 1).astype(np.int64)
     row = np.clip(pixels[:, 1] * _ROWS / camera.height_px, 0, _ROWS - 1).astype(np.int64)
-    return len(np.unique(row * _COLUMNS + column))
+    return np.bincount(row * _COLUMNS + column, minlength=_COLUMNS * _ROWS)
+
+
+def _differ(first: Pose, second: Pose) -> bool:
+    away_m = np.linalg.norm(first.translation_m - second.translation_m)
+    turned_rad = rotation_angle_rad(first.rotation.T @ second.rotation)
+    return bool(away_m > _SAME_PLACE_M or turned_rad > _SAME_VIEW_RAD)

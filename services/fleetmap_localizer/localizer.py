@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap.camera import Camera
 from fleetmap.drive import Frame
@@ -20,22 +17,11 @@ from fleetmap.vision.features import FeatureExtractor, Features
 from fleetmap.vision.matching import match_by_projection, match_descriptors
 from fleetmap.vision.place_recognition import PlaceIndex
 from fleetmap.visual_map import LocalizationMap
-from fleetmap_localizer.gate import is_trustworthy
+from fleetmap_localizer.gate import Fit, best_unrivalled, is_trustworthy
 from fleetmap_localizer.local_map import Indices, LocalMap
 from fleetmap_localizer.motion import Motion
 from fleetmap_localizer.pose_estimate import PoseEstimate
 from fleetmap_localizer.settings import LocalizerSettings
-
-Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class _Fit:
-    """A pose, the pixels (P, 2) it was fitted to, and how many landmarks should have been among them."""
-
-    answer: AbsolutePose
-    pixels: Array
-    landmarks_in_view: int
 
 
 class Localizer:
@@ -79,10 +65,11 @@ class Localizer:
 
     def localize_features(self, features: Features, stamp_ns: int) -> PoseEstimate | None:
         """The same for an image whose features are known already, as when several maps are asked."""
-        answer = self._track(features, stamp_ns)
-        if answer is None:
-            answer = self._relocalize(features, stamp_ns)
-        self._remember(stamp_ns, answer)
+        motion = self._recent_motion(stamp_ns)
+        answer = None if motion is None else self._track(features, stamp_ns, motion)
+        if answer is None or self._lost_support(answer, motion):
+            answer = _stronger(answer, self._relocalize(features, stamp_ns, motion))
+        self._remember(stamp_ns, answer, motion)
         if answer is None:
             return None
         return PoseEstimate(
@@ -94,35 +81,46 @@ class Localizer:
             inlier_count=answer.inlier_count,
         )
 
-    def _track(self, features: Features, stamp_ns: int) -> AbsolutePose | None:
+    def _track(self, features: Features, stamp_ns: int, motion: Motion) -> AbsolutePose | None:
         """Search around where the vehicle should be by now."""
         settings = self._settings.tracking
-        motion = self._recent_motion(stamp_ns)
-        if motion is None:
-            return None
         predicted = motion.predict(stamp_ns)
+        best = None
         for radii_px in settings.radii_px:
-            answer = self._fit(features, predicted, radii_px, self._settings.gate.min_inliers_tracking)
-            if answer is not None and motion.can_reach(stamp_ns, answer.map_from_cam, settings):
-                return answer
-        return None
+            fit = self._fit(features, predicted, radii_px)
+            if (
+                fit is not None
+                and is_trustworthy(fit, self._camera, settings.gate)
+                and motion.can_reach(stamp_ns, fit.answer.map_from_cam, settings)
+            ):
+                best = _stronger(best, fit.answer)
+            if best is not None and not self._lost_support(best, motion):
+                break
+        return best
 
-    def _relocalize(self, features: Features, stamp_ns: int) -> AbsolutePose | None:
+    def _lost_support(self, answer: AbsolutePose, motion: Motion | None) -> bool:
+        """Whether far fewer landmarks agree than on the image before.
+
+        In wide windows some landmarks always find a partner, and those may agree on a wrong pose.
+        """
+        kept = self._settings.tracking.min_kept_support
+        return motion is not None and answer.inlier_count < kept * motion.inlier_count
+
+    def _relocalize(self, features: Features, stamp_ns: int, motion: Motion | None) -> AbsolutePose | None:
         """Search from nothing: like places, landmarks matched by descriptor alone, then by projection."""
         settings = self._settings.relocalization
-        motion = self._recent_motion(stamp_ns)
+        fits = []
         for landmarks in self._candidate_places(features):
             initial = self._pose_among(features, landmarks)
-            if initial is None:
-                continue
-            answer = self._fit(
-                features, initial, settings.radii_px, self._settings.gate.min_inliers_relocalization
-            )
-            if answer is None:
-                continue
-            if motion is None or motion.can_reach(stamp_ns, answer.map_from_cam, self._settings.tracking):
-                return answer
-        return None
+            fit = None if initial is None else self._fit(features, initial, settings.radii_px)
+            if fit is not None:
+                fits.append(fit)
+        best = best_unrivalled(fits, settings.max_rival)
+        if best is None or not is_trustworthy(best, self._camera, settings.gate):
+            return None
+        if motion and not motion.can_reach(stamp_ns, best.answer.map_from_cam, self._settings.tracking):
+            return None
+        return best.answer
 
     def _candidate_places(self, features: Features) -> list[Indices]:
         """Landmarks of the likeliest places, best first; no keyframe stands for two of them."""
@@ -156,10 +154,8 @@ class Localizer:
         )
         return None if answer is None else answer.map_from_cam
 
-    def _fit(
-        self, features: Features, guess: Pose, radii_px: tuple[float, ...], min_inliers: int
-    ) -> AbsolutePose | None:
-        """Match landmarks around a guess by projection and refine, in ever smaller windows; gate the result."""
+    def _fit(self, features: Features, guess: Pose, radii_px: tuple[float, ...]) -> Fit | None:
+        """Match landmarks around a guess by projection and refine, in ever smaller windows."""
         around = self._local_map.landmarks_around(guess)
         fit = None
         for radius_px in radii_px:
@@ -167,13 +163,9 @@ class Localizer:
             if fit is None:
                 return None
             guess = fit.answer.map_from_cam
-        if fit is None or not is_trustworthy(
-            fit.answer, fit.pixels, fit.landmarks_in_view, min_inliers, self._camera, self._settings.gate
-        ):
-            return None
-        return fit.answer
+        return fit
 
-    def _fit_once(self, features: Features, guess: Pose, around: Indices, radius_px: float) -> _Fit | None:
+    def _fit_once(self, features: Features, guess: Pose, around: Indices, radius_px: float) -> Fit | None:
         settings = self._settings.tracking
         group = self._content.landmarks
         predictions = self._local_map.predict(around, guess)
@@ -192,7 +184,7 @@ class Localizer:
         answer = refine_absolute_pose(
             pixels, group.points_m[landmarks], features.sigmas_px[seen], self._camera, guess
         )
-        return None if answer is None else _Fit(answer, pixels, len(predictions.landmarks))
+        return None if answer is None else Fit(answer, pixels, predictions.pixels, features.pixels)
 
     def _recent_motion(self, stamp_ns: int) -> Motion | None:
         """The track so far, unless it ended too long ago, or time has not gone on."""
@@ -201,9 +193,15 @@ class Localizer:
         elapsed_s = (stamp_ns - self._motion.stamp_ns) * 1e-9
         return self._motion if 0.0 < elapsed_s <= self._settings.tracking.max_gap_s else None
 
-    def _remember(self, stamp_ns: int, answer: AbsolutePose | None) -> None:
+    def _remember(self, stamp_ns: int, answer: AbsolutePose | None, motion: Motion | None) -> None:
         if answer is None:
             return
-        motion = self._recent_motion(stamp_ns)
-        pose = answer.map_from_cam
-        self._motion = Motion(stamp_ns, pose) if motion is None else motion.follow(stamp_ns, pose)
+        pose, inliers = answer.map_from_cam, answer.inlier_count
+        self._motion = motion.follow(stamp_ns, pose, inliers) if motion else Motion(stamp_ns, pose, inliers)
+
+
+def _stronger(first: AbsolutePose | None, second: AbsolutePose | None) -> AbsolutePose | None:
+    """The answer with more inliers; the first where they have equally many."""
+    if first is None or second is None:
+        return first or second
+    return second if second.inlier_count > first.inlier_count else first

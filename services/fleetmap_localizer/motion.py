@@ -16,12 +16,13 @@ class Motion:
 
     stamp_ns: int
     map_from_cam: Pose
+    inlier_count: int
     previous_stamp_ns: int | None = None
     map_from_previous: Pose | None = None
 
-    def follow(self, stamp_ns: int, map_from_cam: Pose) -> Motion:
+    def follow(self, stamp_ns: int, map_from_cam: Pose, inlier_count: int) -> Motion:
         """The motion after one more pose."""
-        return Motion(stamp_ns, map_from_cam, self.stamp_ns, self.map_from_cam)
+        return Motion(stamp_ns, map_from_cam, inlier_count, self.stamp_ns, self.map_from_cam)
 
     def predict(self, stamp_ns: int) -> Pose:
         """``map_from_cam`` at a later time; where it stands while its velocity is not known."""

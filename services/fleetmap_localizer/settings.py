@@ -18,6 +18,18 @@ class LocalMapSettings:
 
 
 @dataclass(frozen=True)
+class GateSettings:
+    """What a pose must show before it is believed: no pose is better than a wrong one."""
+
+    min_inliers: int
+    min_coverage: float  # share of the view's cells, where landmarks are expected, in which some agree
+    max_position_sigma_m: float
+    max_rotation_sigma_deg: float = 1.0
+    min_inlier_ratio: float = 0.5  # inliers per matched landmark
+    min_occupied_cells: int = 6  # of a grid of 8 x 4 over the image
+
+
+@dataclass(frozen=True)
 class RelocalizationSettings:
     """The search from nothing."""
 
@@ -30,6 +42,8 @@ class RelocalizationSettings:
     min_ransac_inliers: int = 10
     ransac_error_px: float = 6.0
     radii_px: tuple[float, ...] = (12.0, 5.0)  # windows around the projections, round after round
+    max_rival: float = 0.8  # another place with this share of the best's inliers makes the answer ambiguous
+    gate: GateSettings = GateSettings(min_inliers=20, min_coverage=0.55, max_position_sigma_m=0.2)
 
 
 @dataclass(frozen=True)
@@ -40,22 +54,12 @@ class TrackingSettings:
     max_distance: int = 64  # Hamming bits
     ratio: float = 0.9
     radii_px: tuple[tuple[float, ...], ...] = ((15.0, 5.0), (40.0, 12.0, 5.0))  # the second if the first fails
+    min_kept_support: float = 0.6  # of the inliers before; with fewer, other places are looked at as well
     max_acceleration_mps2: float = 15.0  # a pose that the vehicle cannot have reached is not believed
     max_speed_mps: float = 80.0
     slack_m: float = 0.5
-
-
-@dataclass(frozen=True)
-class GateSettings:
-    """What a pose must show before it is reported: no pose is better than a wrong one."""
-
-    min_inliers_tracking: int = 15
-    min_inliers_relocalization: int = 20
-    min_inlier_ratio: float = 0.5  # inliers per matched landmark
-    min_seen_ratio: float = 0.06  # inliers per landmark that should be in view
-    min_occupied_cells: int = 6  # of a grid of 8 x 4 over the image
-    max_position_sigma_m: float = 0.3
-    max_rotation_sigma_deg: float = 1.0
+    # Looser: a prediction from images before vouches for the place, and traffic may hide half the view.
+    gate: GateSettings = GateSettings(min_inliers=15, min_coverage=0.3, max_position_sigma_m=0.3)
 
 
 @dataclass(frozen=True)
@@ -67,4 +71,3 @@ class LocalizerSettings:
     local_map: LocalMapSettings = field(default_factory=LocalMapSettings)
     relocalization: RelocalizationSettings = field(default_factory=RelocalizationSettings)
     tracking: TrackingSettings = field(default_factory=TrackingSettings)
-    gate: GateSettings = field(default_factory=GateSettings)
