@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 _COLUMNS, _ROWS = 8, 4
 _POPULATED = 5  # landmarks and features that a cell must have for its silence to mean something
 _MIN_POPULATED_CELLS = 4
-_SAME_PLACE_M, _SAME_VIEW_RAD = 1.0, np.radians(5.0)
+_SAME_PLACE_M, _SAME_VIEW_RAD = 0.7, np.radians(3.0)
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,8 @@ def best_unrivalled(fits: list[Fit], max_rival: float) -> Fit | None:
     rivals = [
         fit
         for fit in fits
-        if fit.answer.inlier_count >= limit and _differ(fit.answer.map_from_cam, best.answer.map_from_cam)
+        if fit.answer.inlier_count >= limit
+        and not is_same_place(fit.answer.map_from_cam, best.answer.map_from_cam)
     ]
     return None if rivals else best
 
@@ -84,7 +85,8 @@ def _per_cell(pixels: Array, camera: Camera) -> NDArray[np.int64]:
     return np.bincount(row * _COLUMNS + column, minlength=_COLUMNS * _ROWS)
 
 
-def _differ(first: Pose, second: Pose) -> bool:
+def is_same_place(first: Pose, second: Pose) -> bool:
+    """Whether two poses are so close that they are taken for one answer."""
     away_m = np.linalg.norm(first.translation_m - second.translation_m)
     turned_rad = rotation_angle_rad(first.rotation.T @ second.rotation)
-    return bool(away_m > _SAME_PLACE_M or turned_rad > _SAME_VIEW_RAD)
+    return bool(away_m <= _SAME_PLACE_M and turned_rad <= _SAME_VIEW_RAD)

@@ -52,9 +52,17 @@ class LocalMap:
             + np.log(scale_factor) * content.landmarks.octaves
         )
 
-    def landmarks_of(self, keyframes: Indices) -> Indices:
-        """Landmarks (L,) that any of the keyframes saw, sorted."""
-        return _gather(self._content.seen_landmark, self._keyframe_starts, keyframes)
+    def landmarks_of(self, keyframes: Indices, max_count: int | None = None) -> Indices:
+        """Landmarks (L,) that any of the keyframes saw; at most ``max_count``, those that most of them saw."""
+        seen = [
+            self._content.seen_landmark[self._keyframe_starts[k] : self._keyframe_starts[k + 1]]
+            for k in keyframes.tolist()
+        ]
+        counts = np.bincount(np.concatenate(seen), minlength=len(self._content.landmarks))
+        landmarks = np.flatnonzero(counts)
+        if max_count is None or len(landmarks) <= max_count:
+            return landmarks
+        return np.asarray(landmarks[np.argsort(-counts[landmarks], kind="stable")[:max_count]])
 
     def covisible(self, keyframe: int, min_shared: int, count: int) -> Indices:
         """At most ``count`` keyframes that share landmarks with this one, the most first; itself not included."""
@@ -96,8 +104,3 @@ class LocalMap:
         pixels = self._camera.project_ideal(points_in_cam[visible])
         clipped = np.clip(octaves[visible], 0, self._octave_count - 1).astype(np.int64)
         return Predictions(landmarks[visible], pixels, clipped)
-
-
-def _gather(values: NDArray[np.int32], starts: NDArray[np.int64], rows: Indices) -> Indices:
-    pieces = [values[starts[row] : starts[row + 1]] for row in rows.tolist()]
-    return np.unique(np.concatenate(pieces)).astype(np.int64) if pieces else np.zeros(0, dtype=np.int64)

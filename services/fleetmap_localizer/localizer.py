@@ -17,7 +17,7 @@ from fleetmap.vision.features import FeatureExtractor, Features
 from fleetmap.vision.matching import match_by_projection, match_descriptors
 from fleetmap.vision.place_recognition import PlaceIndex
 from fleetmap.visual_map import LocalizationMap
-from fleetmap_localizer.gate import Fit, best_unrivalled, is_trustworthy
+from fleetmap_localizer.gate import Fit, best_unrivalled, is_same_place, is_trustworthy
 from fleetmap_localizer.local_map import Indices, LocalMap
 from fleetmap_localizer.motion import Motion
 from fleetmap_localizer.pose_estimate import PoseEstimate
@@ -109,10 +109,12 @@ class Localizer:
     def _relocalize(self, features: Features, stamp_ns: int, motion: Motion | None) -> AbsolutePose | None:
         """Search from nothing: like places, landmarks matched by descriptor alone, then by projection."""
         settings = self._settings.relocalization
-        fits = []
+        fits: list[Fit] = []
         for landmarks in self._candidate_places(features):
             initial = self._pose_among(features, landmarks)
-            fit = None if initial is None else self._fit(features, initial, settings.radii_px)
+            if initial is None or any(is_same_place(initial, fit.answer.map_from_cam) for fit in fits):
+                continue
+            fit = self._fit(features, initial, settings.radii_px)
             if fit is not None:
                 fits.append(fit)
         best = best_unrivalled(fits, settings.max_rival)
@@ -131,7 +133,7 @@ class Localizer:
             best = int(np.argmax(scores))
             neighbours = self._local_map.covisible(best, settings.min_shared_landmarks, settings.neighbours)
             group = np.append(neighbours, best)
-            places.append(self._local_map.landmarks_of(group))
+            places.append(self._local_map.landmarks_of(group, settings.max_landmarks))
             scores[group] = 0.0
         return places
 
