@@ -26,6 +26,7 @@ Array = NDArray[np.float64]
 MAX_IMAGE_GAP_NS = 500_000_000  # a fix between two posed images further apart than this is not used
 MIN_FIXES = 3
 MIN_SPAN_SIGMAS = 10.0  # a drive must be this many fix sigmas long before it can be placed
+CLEAR_EVIDENCE = 10.0  # half a chi-square: more than four sigmas
 HUBER_SIGMAS = 2.7955  # sqrt of the 95 % point of chi-square with 3 degrees of freedom
 
 
@@ -126,12 +127,15 @@ def georeference(path: Sequence[PathPoint], track: GnssTrack, level_sigma_deg: f
         level = (S.rotation @ rotations)[:, 2, 0].mean() / np.radians(level_sigma_deg)
         return np.append(errors.ravel(), level)
 
-    first = _umeyama_with_lever_arm(positions, rotations, targets, track.antenna_in_cam_m)
-    fits = []
-    for start in (first, _levelled(first, positions, rotations)):
+    def fitted(start: Sim3) -> tuple[float, Sim3]:
         fit = least_squares(partial(residuals, start), np.zeros(7), x_scale="jac")
-        fits.append((float(fit.cost), at(start, fit.x)))
-    return min(fits, key=lambda f: f[0])[1]
+        return float(fit.cost), at(start, fit.x)
+
+    first = _umeyama_with_lever_arm(positions, rotations, targets, track.antenna_in_cam_m)
+    cost, S = fitted(first)
+    upright_cost, upright = fitted(_levelled(first, positions, rotations))
+    # On a straight road a world turned upside down fits as well: only clear evidence may speak for it.
+    return S if cost < upright_cost - CLEAR_EVIDENCE else upright
 
 
 def _check_observable(fixes: NDArray[np.int64], track: GnssTrack) -> None:
