@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.geometry import Pose, nearest_rotations
+from fleetmap.geometry import Pose
 from fleetmap.vision.absolute_pose import (
     AbsolutePose,
     AbsolutePoseSettings,
@@ -122,8 +122,7 @@ def _project_and_refine(
     )
     if pose is None:
         return None
-    rotation = nearest_rotations(pose.map_from_cam.rotation)  # or its error triples from frame to frame
-    return Tracked(Pose(rotation, pose.map_from_cam.translation_m), landmarks[pose.inliers], found[pose.inliers])
+    return Tracked(pose.map_from_cam, landmarks[pose.inliers], found[pose.inliers])
 
 
 def _visible(

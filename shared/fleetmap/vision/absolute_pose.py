@@ -13,7 +13,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from fleetmap.camera import Camera
-from fleetmap.geometry import Pose
+from fleetmap.geometry import Pose, nearest_rotations
 
 Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -130,7 +130,8 @@ def refine_absolute_pose(
     if covariance is None:
         return None
     variance = squares / (2 * count - 6)
-    return AbsolutePose(Pose(rotation, centre), inliers, covariance * max(1.0, variance))
+    # Steps multiply rotations, and a tracker hands the result on: without this, rounding errors pile up.
+    return AbsolutePose(Pose(nearest_rotations(rotation), centre), inliers, covariance * max(1.0, variance))
 
 
 def _inverse(information: Array) -> Array | None:
