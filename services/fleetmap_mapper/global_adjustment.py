@@ -73,7 +73,7 @@ def adjust_globally(problem: GlobalProblem, max_iterations: int = 30) -> GlobalO
         values.insert(L(j), point)
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(max_iterations)
-    parameters.setRelativeErrorTol(1e-6)
+    parameters.setRelativeErrorTol(1e-5)
     parameters.setOrdering(_points_first(len(problem.poses), len(problem.points_m)))
     optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
     initial_cost = float(optimizer.error())
