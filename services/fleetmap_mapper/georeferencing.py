@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 MAX_IMAGE_GAP_NS = 500_000_000  # a fix between two posed images further apart than this is not used
 MIN_FIXES = 3
 MIN_SPAN_SIGMAS = 10.0  # a drive must be this many fix sigmas long before it can be placed
-CLEAR_EVIDENCE = 10.0  # half a chi-square: more than four sigmas
+CLEAR_EVIDENCE = 10.0, 4.0  # in half chi-squares (over four sigmas) and, as drift inflates these, as a ratio
 HUBER_SIGMAS = 2.7955  # sqrt of the 95 % point of chi-square with 3 degrees of freedom
 
 
@@ -135,7 +135,8 @@ def georeference(path: Sequence[PathPoint], track: GnssTrack, level_sigma_deg: f
     cost, S = fitted(first)
     upright_cost, upright = fitted(_levelled(first, positions, rotations))
     # On a straight road a world turned upside down fits as well: only clear evidence may speak for it.
-    return S if cost < upright_cost - CLEAR_EVIDENCE else upright
+    least, ratio = CLEAR_EVIDENCE
+    return S if least + ratio * cost < upright_cost else upright
 
 
 def _check_observable(fixes: NDArray[np.int64], track: GnssTrack) -> None:
