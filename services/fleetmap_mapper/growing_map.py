@@ -130,10 +130,8 @@ class GrowingMap:
                 target[a] = b
                 self.found[b] += self.found[a]
                 self.visible[b] += self.visible[a]
-        ended = np.array([_end(target, int(i)) for i in np.unique(lost)], dtype=np.int32)
-        sources = np.unique(lost)
-        target[sources] = ended
-        gone = sources[ended != sources]
+        gone = np.flatnonzero(target != np.arange(self.landmark_count))
+        target[gone] = [_end(target, int(i)) for i in gone]
         self.merged_into[gone] = target[gone]
         self.alive[gone] = False
         is_target = np.zeros(self.landmark_count + 1, np.bool_)  # the last entry stands for "no landmark"
