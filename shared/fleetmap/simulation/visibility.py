@@ -27,6 +27,7 @@ Boxes = list[tuple[slice, slice] | None]  # rows, columns of each surface
 
 NOTHING = -1  # the id of the sky
 _NEAR_M = 0.2
+_NEARLY_ZERO = np.float32(1e-12)
 _EMPTY = (slice(0, 0), slice(0, 0))
 
 
@@ -157,6 +158,7 @@ def visible_surfaces(surfaces: Surfaces, atlas: Atlas, view: View, boxes: Boxes,
         pyramid = atlas.opacities[surfaces.texture_indices[surface]]
         if pyramid is not None:
             scale_here = values[0] + values[2]
+            scale_here[scale_here == 0.0] = _NEARLY_ZERO  # on the surface's own horizon, where it is never seen
             mask &= _is_opaque(pyramid, values[0] / scale_here, values[1] / scale_here)
         seen = mask.view(np.uint8)  # cv2.copyTo writes into the views in place, faster than numpy's masked copy
         cv2.copyTo(values[4], seen, buffer)
