@@ -69,11 +69,15 @@ def localize(
     if server is None and map_ is None:
         raise click.UsageError("where is the map? Give --server ENDPOINT, or --map FOLDER")
     drive = open_drive(recording, image_topic=image_topic, gnss_topic=gnss_topic)
-    if use_gnss and near is None:
+    camera = drive.camera
+    if use_gnss and map_ is None and near is None:
         near = _first_fix(drive)
     with _maps(server, map_, near, cache) as maps:
-        frames = tqdm(drive.frames(), total=drive.frame_count, unit="image", desc="localize", file=sys.stderr)
-        result = localize_drive(frames, drive.camera, maps)
+        # disable=None: no bar where stderr is a file or a pipe
+        frames = tqdm(
+            drive.frames(), total=drive.frame_count, unit="image", desc="localize", file=sys.stderr, disable=None
+        )
+        result = localize_drive(frames, camera, maps)
     write_trajectory(trajectory, result.trajectory())
     click.echo(f"map:            {result.map_id} (version {result.version[:12]})")
     click.echo(f"frames:         {result.frame_count}")

@@ -60,8 +60,6 @@ class FeatureExtractor:
     def __init__(self, camera: Camera, settings: FeatureSettings | None = None) -> None:
         self.camera = camera
         self.settings = settings or FeatureSettings()
-        # Repeatable and without a pool of threads that fights with the caller's own.
-        cv2.setNumThreads(1)
         self._detectors = [
             _orb(self.settings, threshold)
             for threshold in (self.settings.fast_threshold, self.settings.faint_fast_threshold)

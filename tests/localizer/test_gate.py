@@ -1,0 +1,82 @@
+"""The gate: many inliers are not enough, they must fill the view and have no rival."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from fleetmap.camera import Camera
+from fleetmap.geometry import Pose, so3_exp
+from fleetmap.vision.absolute_pose import AbsolutePose
+from fleetmap_localizer.gate import Fit, best_unrivalled, is_trustworthy
+from fleetmap_localizer.settings import GateSettings
+
+CAMERA = Camera(800, 400, 500.0, 500.0, 399.5, 199.5)
+SETTINGS = GateSettings(min_inliers=20, min_coverage=0.5, max_position_sigma_m=0.2)
+EVERYWHERE = np.stack(np.meshgrid(np.arange(5, 800, 20.0), np.arange(5, 400, 20.0)), axis=-1).reshape(-1, 2)
+
+
+def fit(
+    inlier_px: np.ndarray,
+    outliers: int = 0,
+    position_sigma_m: float = 0.02,
+    rotation_sigma_deg: float = 0.1,
+    predicted_px: np.ndarray = EVERYWHERE,
+    position_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> Fit:
+    inliers = np.arange(len(inlier_px) + outliers) < len(inlier_px)
+    pixels = np.vstack([inlier_px, np.full((outliers, 2), 10.0)])
+    sigmas = np.r_[np.full(3, np.radians(rotation_sigma_deg)), np.full(3, position_sigma_m)]
+    answer = AbsolutePose(Pose(np.eye(3), np.array(position_m)), inliers, np.diag(sigmas**2))
+    return Fit(answer, pixels, predicted_px, EVERYWHERE)
+
+
+def trusted(candidate: Fit) -> bool:
+    return is_trustworthy(candidate, CAMERA, SETTINGS)
+
+
+def test_landmarks_that_agree_all_over_the_view_are_trusted() -> None:
+    assert trusted(fit(EVERYWHERE[::10]))
+
+
+def test_too_few_inliers_or_too_many_outliers_are_not() -> None:
+    assert len(EVERYWHERE[::44]) < 20 <= len(EVERYWHERE[::38])
+    assert not trusted(fit(EVERYWHERE[::44]))
+    assert trusted(fit(EVERYWHERE[::10], outliers=70))
+    assert not trusted(fit(EVERYWHERE[::10], outliers=90))
+
+
+def test_a_copy_of_one_house_is_not_trusted_however_many_points_it_has() -> None:
+    left_quarter = EVERYWHERE[EVERYWHERE[:, 0] < 200]
+    assert len(left_quarter) == 200
+    assert not trusted(fit(left_quarter))
+    assert trusted(fit(left_quarter, predicted_px=left_quarter))  # nothing was expected elsewhere
+
+
+def test_all_points_in_a_few_cells_are_not_trusted() -> None:
+    corner = EVERYWHERE[(EVERYWHERE[:, 0] < 200) & (EVERYWHERE[:, 1] < 100)]
+    assert len(corner) == 50
+    assert not trusted(fit(corner, predicted_px=corner))
+
+
+def test_a_pose_that_is_hardly_held_is_not_trusted() -> None:
+    assert not trusted(fit(EVERYWHERE[::10], position_sigma_m=0.21))
+    assert not trusted(fit(EVERYWHERE[::10], rotation_sigma_deg=1.1))
+
+
+def test_the_best_of_several_wins_unless_another_place_explains_the_image_as_well() -> None:
+    best = fit(EVERYWHERE[::5])
+    same = fit(EVERYWHERE[::6], position_m=(0.3, 0.0, 0.0))
+    elsewhere = fit(EVERYWHERE[::6], position_m=(3.0, 0.0, 0.0))
+    weak = fit(EVERYWHERE[::10], position_m=(3.0, 0.0, 0.0))
+    assert best_unrivalled([same, weak, best], max_rival=0.8) is best
+    assert best_unrivalled([elsewhere, best], max_rival=0.8) is None
+    assert best_unrivalled([], max_rival=0.8) is None
+
+
+def test_a_rival_may_stand_on_the_same_spot_and_look_elsewhere() -> None:
+    best, other = fit(EVERYWHERE[::5]), fit(EVERYWHERE[::6])
+    turned = Pose(so3_exp(np.array([0.0, 0.2, 0.0])), np.zeros(3))
+    other = replace(other, answer=replace(other.answer, map_from_cam=turned))
+    assert best_unrivalled([best, other], max_rival=0.8) is None
