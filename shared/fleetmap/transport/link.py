@@ -10,17 +10,10 @@ from pydantic import BaseModel, ValidationError
 
 from fleetmap.errors import ServerError, ServerRefusedError, ServerUnreachableError, StorageError, TransferError
 from fleetmap.transport import protocol
-from fleetmap.transport.session import (
-    NoAnswerError,
-    ProblemError,
-    Question,
-    ask,
-    open_client,
-    unreachable,
-)
+from fleetmap.transport.session import Connection, NoAnswerError, ProblemError, Question, unreachable
 
 _CONNECT_TIMEOUT_S = 2.0
-_HELLO_TIMEOUT_S = 3.0  # from the first attempt to connect
+_HELLO_TIMEOUT_S = 2.5  # from the first attempt to connect
 _PAUSE_S = 0.1  # between two attempts at the same request
 _STATUS_BUSY, _STATUS_DISK_FULL = 503, 507
 
@@ -45,17 +38,11 @@ class ServerLink:
         self.endpoint = protocol.check_endpoint(endpoint)
         self._timeout_s = timeout_s
         self._patience_s = patience_s
-        deadline_s = time.monotonic() + _HELLO_TIMEOUT_S
-        self._session = open_client(endpoint, _CONNECT_TIMEOUT_S)
-        try:
-            self._await_hello(deadline_s)
-        except BaseException:
-            self.close()
-            raise
+        self._connection = self._connect(time.monotonic() + _HELLO_TIMEOUT_S)
 
     def close(self) -> None:
         """End the connection."""
-        self._session.close()  # type: ignore[no-untyped-call]
+        self._connection.close()
 
     def request(self, message: type[Message], operation: str, parameters: Parameters) -> Message:
         """Ask for a JSON message.
@@ -81,34 +68,69 @@ class ServerLink:
         """One attempt at a request."""
         words = {name: str(value) for name, value in parameters.items()}
         bulk = payload is not None or operation == protocol.CHUNK
-        return ask(self._session, operation, words, payload, self._timeout_s, bulk)
+        return self._connection.ask(operation, words, payload, self._timeout_s, bulk)
 
-    def answer(self, first: Question, operation: str, parameters: Parameters, payload: bytes | None) -> bytes:
-        """The answer to a request already sent, which is sent again as long as patience lasts."""
-        question, deadline_s = first, time.monotonic() + self._patience_s
+    def answer(self, question: Question, operation: str, parameters: Parameters, payload: bytes | None) -> bytes:
+        """The answer to a request already sent.
+
+        Where none comes it is asked again over a new connection. Patience runs from the first time on, and
+        ends only after at least one more attempt, if there is a server to connect to.
+        """
+        deadline_s: float | None = None
         while True:
             try:
                 return question.answer()
             except ProblemError as error:
+                deadline_s = deadline_s or time.monotonic() + self._patience_s
                 if error.problem.status != _STATUS_BUSY or time.monotonic() > deadline_s:
                     raise self._refusal(error.problem) from error
+                time.sleep(_PAUSE_S)
             except NoAnswerError as error:
-                if time.monotonic() > deadline_s:
+                if deadline_s is not None and time.monotonic() > deadline_s:
                     raise NoAnswerError(f"map server at {self.endpoint} answers no more") from error
-            time.sleep(_PAUSE_S)
+                deadline_s = deadline_s or time.monotonic() + self._patience_s
+                self._replace(question.connection, deadline_s)
             question = self.send(operation, parameters, payload)
 
-    def _await_hello(self, deadline_s: float) -> None:
-        """Make sure that a map server is behind the connection: Zenoh alone does not tell."""
+    def _replace(self, failed: Connection, deadline_s: float) -> None:
+        """Connect anew, unless that was done since ``failed`` failed; raises NoAnswerError at the deadline."""
+        if failed is not self._connection:
+            return
+        failed.close()
+        try:
+            self._connection = self._connect(deadline_s)
+        except ServerUnreachableError as error:
+            raise NoAnswerError(f"map server at {self.endpoint} answers no more") from error
+
+    def _connect(self, deadline_s: float) -> Connection:
+        """A connection to a map server that says hello; raises ServerUnreachableError at the deadline."""
         while (left_s := deadline_s - time.monotonic()) > 0.0:
             try:
-                hello = ask(self._session, protocol.HELLO, {}, None, timeout_s=left_s).answer()
+                connection = Connection(self.endpoint, min(left_s, _CONNECT_TIMEOUT_S))
+            except ServerUnreachableError:
+                time.sleep(_PAUSE_S)
+                continue
+            try:
+                self._await_hello(connection, deadline_s)
+                return connection
+            except NoAnswerError:
+                connection.close()
+            except BaseException:
+                connection.close()
+                raise
+        raise ServerUnreachableError(unreachable(self.endpoint))
+
+    def _await_hello(self, connection: Connection, deadline_s: float) -> None:
+        """Make sure that a map server is behind the connection: Zenoh alone does not tell."""
+        while not connection.is_broken and (left_s := deadline_s - time.monotonic()) > 0.0:
+            try:
+                hello = connection.ask(protocol.HELLO, {}, None, timeout_s=left_s).answer()
             except NoAnswerError:
                 time.sleep(_PAUSE_S)
                 continue
             self.read(protocol.Hello, hello)
             return
-        raise ServerUnreachableError(unreachable(self.endpoint))
+        raise NoAnswerError("no map server says hello")
 
     def _refusal(self, problem: protocol.Problem) -> ServerError | StorageError:
         kind = StorageError if problem.status == _STATUS_DISK_FULL else ServerRefusedError

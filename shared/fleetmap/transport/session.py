@@ -7,20 +7,27 @@ when a message is dropped. Here an empty end is always ``NoAnswerError``.
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Mapping
+from queue import Empty, SimpleQueue
+from threading import Event
 from typing import Any
 
 import zenoh
+from pydantic import ValidationError
 
 from fleetmap.errors import RunError, ServerRefusedError, ServerUnreachableError, TransferError
 from fleetmap.transport import protocol
 
 # One message may wait this long for a slow link before Zenoh gives the whole connection up; the default
 # of 5 s loses 5 MiB on a link of 100 kB/s.
-_PATIENCE_OF_LINK_US = 60_000_000
+# The price: about one cut connection in twenty is noticed only after this time.
+_PATIENCE_OF_LINK_US = 20_000_000
+_LOOK_UP_S = 0.2  # how often someone who waits looks whether the connection still stands
 _MAX_MESSAGE_BYTES = 8 * 1024 * 1024  # what a peer may make us buffer; chunks are far smaller
 
-Session = zenoh.Session
+
+_log = logging.getLogger(__name__)
 
 
 class NoAnswerError(TransferError):
@@ -35,25 +42,123 @@ class ProblemError(ServerRefusedError):
         self.problem = problem
 
 
-def open_client(endpoint: str, connect_timeout_s: float) -> Session:
-    """A session in client mode, connected to one server.
+class Connection:
+    """A session in client mode, connected to one server, and of use only as long as that connection stands.
+
+    Zenoh connects again by itself, but a request that falls between the two connections is lost without
+    a word. So what was asked over a connection that broke counts as not answered, at once.
+
+    Args:
+        endpoint: ``tcp/HOST:PORT`` of the server.
+        timeout_s: how long to try to connect.
 
     Raises:
         ServerUnreachableError: nothing that speaks Zenoh accepts connections there.
     """
-    settings: dict[str, Any] = {
-        "mode": "client",
-        "connect/endpoints": [endpoint],
-        "connect/timeout_ms": round(1e3 * connect_timeout_s),
-        "connect/exit_on_failure": True,
-    }
+
+    def __init__(self, endpoint: str, timeout_s: float) -> None:
+        settings: dict[str, Any] = {
+            "mode": "client",
+            "connect/endpoints": [endpoint],
+            "connect/timeout_ms": round(1e3 * timeout_s),
+            "connect/exit_on_failure": True,
+        }
+        try:
+            self._session = zenoh.open(_config(settings))
+        except zenoh.ZError as error:
+            raise ServerUnreachableError(unreachable(endpoint)) from error
+        self._broken = Event()
+        self._events = self._session.info.declare_transport_events_listener(self._note)
+
+    @property
+    def is_broken(self) -> bool:
+        """Whether the connection has been lost, or closed."""
+        return self._broken.is_set()
+
+    def close(self) -> None:
+        """End it; what was asked over it is not answered any more."""
+        self._broken.set()
+        self._session.close()  # type: ignore[no-untyped-call]
+
+    def ask(
+        self,
+        operation: str,
+        parameters: Mapping[str, str],
+        payload: bytes | None,
+        timeout_s: float,
+        bulk: bool = False,
+    ) -> Question:
+        """Send a request and return at once; ``bulk`` requests give way to small ones."""
+        question = Question(self)
+        if self.is_broken:
+            question.end()
+            return question
+        try:
+            self._session.get(
+                zenoh.Selector(f"{protocol.KEY_PREFIX}/{operation}", zenoh.Parameters(dict(parameters))),
+                zenoh.handlers.Callback(question.take, question.end, indirect=False),
+                payload=payload,
+                timeout=timeout_s,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                congestion_control=zenoh.CongestionControl.BLOCK,
+                priority=zenoh.Priority.BACKGROUND if bulk else zenoh.Priority.INTERACTIVE_HIGH,
+            )
+        except zenoh.ZError as error:
+            _log.debug("cannot ask for %s: %s", operation, error)
+            question.end()
+        return question
+
+    def _note(self, event: zenoh.TransportEvent) -> None:
+        if event.kind == zenoh.SampleKind.DELETE:
+            self._broken.set()
+
+
+class Question:
+    """A request on its way over a connection."""
+
+    def __init__(self, connection: Connection) -> None:
+        self.connection = connection
+        self._replies: SimpleQueue[zenoh.Reply | None] = SimpleQueue()  # None: there will be no more
+
+    def take(self, reply: zenoh.Reply) -> None:
+        """Zenoh's callback for each reply."""
+        self._replies.put(reply)
+
+    def end(self) -> None:
+        """Zenoh's callback after the last reply."""
+        self._replies.put(None)
+
+    def answer(self) -> bytes:
+        """Wait for the answer.
+
+        Raises:
+            NoAnswerError: there is none.
+            ProblemError: it is a problem document.
+        """
+        while (reply := self._next()) is not None:
+            if reply.ok is not None:
+                return reply.ok.payload.to_bytes()
+            if reply.err is not None and str(reply.err.encoding) == protocol.PROBLEM_ENCODING:
+                raise ProblemError(_problem(reply.err.payload.to_bytes()))
+        raise NoAnswerError("no answer")
+
+    def _next(self) -> zenoh.Reply | None:
+        while True:
+            try:
+                return self._replies.get(timeout=_LOOK_UP_S)
+            except Empty:
+                if self.connection.is_broken:
+                    return None
+
+
+def _problem(data: bytes) -> protocol.Problem:
     try:
-        return zenoh.open(_config(settings))
-    except zenoh.ZError as error:
-        raise ServerUnreachableError(unreachable(endpoint)) from error
+        return protocol.Problem.model_validate_json(data)
+    except ValidationError:
+        return protocol.Problem(title="Unknown", status=500, detail="it failed without saying why")
 
 
-def open_router(endpoint: str) -> Session:
+def open_router(endpoint: str) -> zenoh.Session:
     """A session in router mode that listens for clients.
 
     Raises:
@@ -68,50 +173,6 @@ def open_router(endpoint: str) -> Session:
 def unreachable(endpoint: str) -> str:
     """The line for a server that is not there."""
     return f"no map server answers at {endpoint}; start one with 'fleetmap serve', or give its endpoint"
-
-
-def ask(
-    session: Session,
-    operation: str,
-    parameters: Mapping[str, str],
-    payload: bytes | None,
-    timeout_s: float,
-    bulk: bool = False,
-) -> Question:
-    """Send a request and return at once; ``bulk`` requests give way to small ones."""
-    try:
-        replies = session.get(
-            zenoh.Selector(f"{protocol.KEY_PREFIX}/{operation}", zenoh.Parameters(dict(parameters))),
-            payload=payload,
-            timeout=timeout_s,
-            consolidation=zenoh.ConsolidationMode.NONE,
-            congestion_control=zenoh.CongestionControl.BLOCK,
-            priority=zenoh.Priority.BACKGROUND if bulk else zenoh.Priority.INTERACTIVE_HIGH,
-        )
-    except zenoh.ZError as error:
-        raise NoAnswerError(f"cannot send a request: {error}") from error
-    return Question(replies)
-
-
-class Question:
-    """A request on its way."""
-
-    def __init__(self, replies: zenoh.Handler[zenoh.Reply]) -> None:
-        self._replies = replies
-
-    def answer(self) -> bytes:
-        """Wait for the answer.
-
-        Raises:
-            NoAnswerError: there is none.
-            ProblemError: it is a problem document.
-        """
-        for reply in self._replies:
-            if reply.ok is not None:
-                return reply.ok.payload.to_bytes()
-            if reply.err is not None and str(reply.err.encoding) == protocol.PROBLEM_ENCODING:
-                raise ProblemError(protocol.Problem.model_validate_json(reply.err.payload.to_bytes()))
-        raise NoAnswerError("no answer")
 
 
 def _config(settings: Mapping[str, Any]) -> zenoh.Config:
