@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fleetmap.geometry import Pose, so3_exp, so3_log
 from fleetmap_localizer.settings import TrackingSettings
@@ -30,7 +31,7 @@ class Motion:
             return self.map_from_cam
         fraction = (stamp_ns - self.stamp_ns) / (self.stamp_ns - self.previous_stamp_ns)
         step = self.map_from_previous.inverse() @ self.map_from_cam
-        return self.map_from_cam @ Pose(so3_exp(fraction * so3_log(step.rotation)), fraction * step.translation_m)
+        return self.map_from_cam @ _fraction_of(step, fraction)
 
     def can_reach(self, stamp_ns: int, map_from_cam: Pose, settings: TrackingSettings) -> bool:
         """Whether a vehicle can be there by then, as far as its brakes, engine and tyres go."""
@@ -40,3 +41,23 @@ class Motion:
             return away_m <= settings.slack_m + settings.max_speed_mps * elapsed_s
         span_s = elapsed_s + (self.stamp_ns - self.previous_stamp_ns) * 1e-9
         return away_m <= settings.slack_m + 0.5 * settings.max_acceleration_mps2 * span_s**2
+
+
+def _fraction_of(step: Pose, fraction: float) -> Pose:
+    """The same screw motion for another length of time: exp(fraction * log(step)) in SE(3)."""
+    rotation_vector = so3_log(step.rotation)
+    velocity = np.linalg.solve(_left_jacobian(rotation_vector), step.translation_m)
+    scaled = fraction * rotation_vector
+    return Pose(so3_exp(scaled), _left_jacobian(scaled) @ (fraction * velocity))
+
+
+def _left_jacobian(rotation_vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    """V of SE(3)'s exponential (3, 3). Source: T. Barfoot, "State Estimation for Robotics", 2017, section 7.1."""
+    angle = float(np.linalg.norm(rotation_vector))
+    x, y, z = rotation_vector
+    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    if angle < 1e-6:
+        return np.asarray(np.eye(3) + 0.5 * K)
+    return np.asarray(
+        np.eye(3) + (1.0 - np.cos(angle)) / angle**2 * K + (angle - np.sin(angle)) / angle**3 * (K @ K)
+    )
