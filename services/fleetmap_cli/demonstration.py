@@ -79,8 +79,7 @@ def demonstrate(*, seed: int, length_m: float, picture: Path, keep: Path | None 
         draw_demonstration(picture, folder)
         click.echo(f"picture: {picture}")
         if keep is not None:
-            with atomic_path(keep) as draft:
-                shutil.copytree(folder, draft, ignore=shutil.ignore_patterns("store", "cache"))
+            _keep(folder, keep)
             click.echo(f"kept:    {keep} (recordings, truth, map and trajectories)")
     stage.finish()
 
@@ -109,10 +108,16 @@ def _require_room_for(picture: Path, keep: Path | None) -> None:
     require_picture_name(picture)
     if picture.is_dir():
         raise InputError(f"cannot draw {picture}: it is a folder; name a file in it")
-    if not os.access(picture.absolute().parent, os.W_OK):
-        raise StorageError(f"cannot write {picture}: there is no such folder, or it cannot be written")
-    if keep is not None and (keep.is_file() or (keep.is_dir() and any(keep.iterdir()))):
-        raise OutputExistsError(f"{keep} exists already and is no empty folder; give another name to --keep")
+    _require_writable_parent(picture)
+    if keep is not None:
+        if keep.is_file() or (keep.is_dir() and any(keep.iterdir())):
+            raise OutputExistsError(f"{keep} exists already and is no empty folder; give another name to --keep")
+        _require_writable_parent(keep)
+
+
+def _require_writable_parent(path: Path) -> None:
+    if not os.access(path.absolute().parent, os.W_OK):
+        raise StorageError(f"cannot write {path}: its folder is not there, or cannot be written")
 
 
 def _record_drives(folder: Path, seed: int, length_m: float) -> None:
@@ -178,3 +183,12 @@ def _print_catalogue(url: str) -> None:
             )
     except (OSError, ValueError, KeyError) as error:
         raise ServerError(f"{url} gave no catalogue of maps: {error}") from error
+
+
+def _keep(folder: Path, target: Path) -> None:
+    """Copy all but the server's store and the localizer's cache, each item whole or not at all."""
+    for item in sorted(folder.iterdir()):
+        if item.name not in ("store", "cache"):
+            with atomic_path(target / item.name) as draft:
+                copy = shutil.copytree if item.is_dir() else shutil.copyfile
+                copy(item, draft)

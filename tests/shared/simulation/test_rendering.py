@@ -145,3 +145,20 @@ def test_the_same_look_gives_the_same_bytes(street: Street, camera: Camera) -> N
     first = render(street, camera, pose, Look(seed=1))
     assert np.array_equal(first, render(street, camera, pose, Look(seed=1)))
     assert not np.array_equal(first, render(street, camera, pose, Look(seed=2)))
+
+
+def test_a_see_through_surface_may_have_its_horizon_in_the_middle_of_a_pixel(street: Street) -> None:
+    """Where a ray is parallel to the surface its texture coordinates are infinite; it is only not seen there."""
+    across, along = np.array([3.0, -3.0, 0.0]), np.array([0.0, 0.0, 4.0])
+    corner = np.array([-2.0, 4.0, 4.0])
+    corners = np.stack([corner, corner + along, corner + across + along, corner + across])
+    builder = SurfaceBuilder(np.array([0.0, 0.0, 1.0]))
+    opacity = np.full((64, 64), 255, dtype=np.uint8)
+    builder.add_quad(corners, builder.add_texture(np.full((64, 64), 90, dtype=np.uint8), opacity), two_sided=True)
+    world = Street(street.anchor, 1.0, street.path, builder.surfaces(), build_atlas(builder.textures))
+    camera = Camera(257, 257, 128.0, 128.0, 128.0, 128.0)
+    with np.errstate(all="raise"):
+        depth = render_depth(world, camera, Pose.identity())
+    row, column = np.indices(depth.shape)
+    assert np.isfinite(depth).any()
+    assert np.isinf(depth[row + column <= 256]).all()
