@@ -16,7 +16,7 @@ def triangulate(camera: Camera, world_from_a: Pose, pixels_a: Array, world_from_
     """Midpoints (N, 3) of the shortest segments between the viewing rays of undistorted pixels (N, 2).
 
     Source: Hartley & Sturm, "Triangulation", CVIU 1997, section 5.1; bundle adjustment refines them.
-    Parallel rays give no point: not a finite one, or one that neither pixel believes.
+    Parallel rays give no point: NaN, or one that neither pixel believes.
     """
     rays_a, rays_b = _rays(camera, world_from_a, pixels_a), _rays(camera, world_from_b, pixels_b)
     baseline = world_from_b.translation_m - world_from_a.translation_m
@@ -25,9 +25,11 @@ def triangulate(camera: Camera, world_from_a: Pose, pixels_a: Array, world_from_
     with np.errstate(divide="ignore", invalid="ignore"):
         reach_a = (along_a - cos * along_b) / (1.0 - cos * cos)
         reach_b = (cos * along_a - along_b) / (1.0 - cos * cos)
-    ends_a = world_from_a.translation_m + reach_a[:, None] * rays_a
-    ends_b = world_from_b.translation_m + reach_b[:, None] * rays_b
-    return np.asarray(0.5 * (ends_a + ends_b))
+        ends_a = world_from_a.translation_m + reach_a[:, None] * rays_a
+        ends_b = world_from_b.translation_m + reach_b[:, None] * rays_b
+        points = 0.5 * (ends_a + ends_b)
+    points[~np.isfinite(points).all(axis=1)] = np.nan
+    return np.asarray(points)
 
 
 def parallax_rad(points: Array, centre_a: Array, centre_b: Array) -> Array:

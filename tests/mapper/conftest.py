@@ -1,16 +1,21 @@
-"""A small world with its truth known, for everything in the mapper that reckons without images."""
+"""A small world of points for what reckons without images, and a simulated drive for the whole mapper."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from fleetmap.camera import Camera
+from fleetmap.drive import Antenna, Frame, GnssFix
+from fleetmap.drives import open_drive
 from fleetmap.geometry import Pose, so3_exp
+from fleetmap_mapper.mapper import MappedDrive, map_drive
+from fleetmap_mapper.settings import MapperSettings
 
 Array = NDArray[np.float64]
 CAMERA = Camera(640, 400, 430.0, 435.0, 322.0, 197.0)
@@ -102,3 +107,47 @@ def drive_through_points(
 @pytest.fixture(scope="session")
 def make_world() -> Callable[..., World]:
     return drive_through_points
+
+
+@dataclass(frozen=True)
+class DriveInMemory:
+    """``fleetmap.drive.Drive`` over decoded images, to be edited with ``dataclasses.replace``."""
+
+    name: str
+    camera: Camera
+    images: tuple[Frame, ...]
+    fixes: tuple[GnssFix, ...]
+    antenna_in_cam_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @property
+    def frame_count(self) -> int:
+        return len(self.images)
+
+    def frames(self) -> Iterator[Frame]:
+        return iter(self.images)
+
+    def gnss_fixes(self) -> list[GnssFix]:
+        return list(self.fixes)
+
+    def antenna(self) -> Antenna:
+        return Antenna(np.array(self.antenna_in_cam_m), "static transform")
+
+    def blacked_out(self, first: int, last: int) -> DriveInMemory:
+        """The same with images ``first`` to ``last`` black."""
+        images = [
+            replace(frame, image=np.zeros_like(frame.image)) if first <= i <= last else frame
+            for i, frame in enumerate(self.images)
+        ]
+        return replace(self, images=tuple(images))
+
+
+@pytest.fixture(scope="session")
+def survey_drive(survey: Any) -> DriveInMemory:
+    drive = open_drive(survey.recording)
+    return DriveInMemory(drive.name, drive.camera, tuple(drive.frames()), tuple(drive.gnss_fixes()))
+
+
+@pytest.fixture(scope="session")
+def mapped(survey_drive: DriveInMemory) -> MappedDrive:
+    """The survey drive mapped with the settings as they come."""
+    return map_drive(survey_drive, MapperSettings())

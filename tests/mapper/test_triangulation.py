@@ -45,6 +45,9 @@ def test_parallel_rays_make_no_point_that_is_believed():
     parallax = parallax_rad(found, FIRST.translation_m, beside.translation_m)
     believed = is_consistent(CAMERA, FIRST, found, pixels, np.ones(2000)) & (parallax > 1e-4)
     assert not believed.any()
+    same_place = triangulate(CAMERA, FIRST, pixels, FIRST, pixels)
+    assert not np.isinf(same_place).any()
+    assert not is_consistent(CAMERA, FIRST, same_place, pixels, np.ones(2000)).any()
 
 
 def test_parallax_is_the_angle_at_the_point():

@@ -1,0 +1,111 @@
+"""A map that should not be published says why."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fleetmap.geodesy import UtmAnchor
+from fleetmap.geometry import Sim3
+from fleetmap.manifest import Quality
+from fleetmap.trajectory import Trajectory
+from fleetmap_mapper.georeferenced_map import PlacedMap
+from fleetmap_mapper.georeferencing import GnssTrack, PathPoint
+from fleetmap_mapper.quality import assess
+from fleetmap_mapper.settings import GnssGroup, MapperSettings
+
+KEYFRAMES = 20
+
+
+@pytest.fixture
+def judge(make_world: Any) -> Callable[..., Quality]:
+    """The quality of a map of a small world; arguments spoil it."""
+    world = make_world(keyframes=KEYFRAMES, points=200, step_m=2.0)
+
+    def judged(
+        frames_total: int = KEYFRAMES,
+        gap_s: float = 0.0,
+        pixel_shift: float = 0.0,
+        fix_shift_m: float = 0.0,
+        outlying_fixes: int = 0,
+        settings: MapperSettings | None = None,
+    ) -> Quality:
+        pixels = world.pixels + pixel_shift * world.sigmas_px[:, None] * [1.0, 0.0]
+        placed = PlacedMap(
+            world.camera,
+            Sim3.identity(),
+            np.arange(KEYFRAMES) * 10**9,
+            world.poses,
+            np.arange(len(world.points), dtype=np.int32),
+            world.points,
+            world.keyframe_index,
+            world.point_index,
+            np.zeros(len(pixels), np.int32),
+            pixels,
+            world.sigmas_px,
+        )
+        stamps = np.arange(KEYFRAMES) * 10**9
+        stamps[KEYFRAMES // 2 :] += int(gap_s * 1e9)
+        trajectory = Trajectory(32632, stamps, world.centres, np.array([p.rotation for p in world.poses]))
+        noise = np.random.default_rng(0).normal(0.0, 0.05, (KEYFRAMES, 3))
+        positions = world.centres + noise + [fix_shift_m, 0.0, 0.0]
+        positions[:outlying_fixes] += 50.0
+        covariances = np.tile(np.eye(3) * 0.05**2, (KEYFRAMES, 1, 1))
+        track = GnssTrack(UtmAnchor(32632, 0, 0, 0), stamps, positions, covariances, np.zeros(3))
+        path = [PathPoint(i, pose) for i, pose in enumerate(world.poses)]
+        drive: Any = SimpleNamespace(frame_count=frames_total)
+        return assess(placed, trajectory, path, track, drive, settings or MapperSettings())
+
+    return judged
+
+
+def test_a_sound_map_is_fit_to_publish(judge):
+    quality = judge()
+    assert quality.publishable
+    assert quality.warnings == ()
+    assert 1.2 < quality.reprojection_rms_px < 1.6  # one sigma in each of two directions
+    assert 0.05 < quality.gnss_residual_rms_m < 0.13
+    assert quality.length_m == pytest.approx(2.0 * (KEYFRAMES - 1))
+    assert (quality.frames_posed, quality.gnss_fixes, quality.keyframes) == (KEYFRAMES, KEYFRAMES, KEYFRAMES)
+
+
+@pytest.mark.parametrize(
+    ("spoilt", "warning"),
+    [
+        ({"frames_total": 22}, "only 20 of 22 images could be posed"),
+        ({"gap_s": 7.0}, "no image is posed for 8.0 s in mid-drive"),
+        ({"pixel_shift": 3.0}, "reprojection errors of 3.3"),
+        ({"fix_shift_m": 1.0}, "the map misses its GNSS fixes by "),
+    ],
+)
+def test_what_is_wrong_is_said(judge, spoilt, warning):
+    quality = judge(**spoilt)
+    assert not quality.publishable
+    assert len(quality.warnings) == 1
+    assert quality.warnings[0].startswith(warning)
+
+
+def test_a_few_fixes_far_off_are_the_receivers_fault_and_not_the_maps(judge):
+    quality = judge(outlying_fixes=5)
+    assert quality.publishable
+    assert quality.gnss_residual_rms_m > 10.0
+
+
+def test_plain_slam_is_not_judged_by_its_fixes(judge):
+    assert judge(fix_shift_m=1.0, settings=MapperSettings(gnss=GnssGroup(mode="none"))).publishable
+
+
+def test_each_limit_is_a_setting(judge):
+    settings = MapperSettings()
+    patient = replace_quality(settings, min_posed_ratio=0.5, max_unposed_gap_s=60.0, max_reprojection_rms_px=9.0)
+    assert judge(frames_total=30, gap_s=20.0, pixel_shift=3.0, settings=patient).publishable
+    strict = replace_quality(settings, max_reprojection_rms_px=1.0, max_gnss_residual_sigmas=0.1)
+    assert len(judge(settings=strict).warnings) == 2
+
+
+def replace_quality(settings: MapperSettings, **limits: float) -> MapperSettings:
+    return settings.model_copy(update={"quality": settings.quality.model_copy(update=limits)})
