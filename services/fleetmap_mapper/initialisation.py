@@ -20,6 +20,7 @@ from fleetmap_mapper.triangulation import is_consistent, parallax_rad, triangula
 
 Array = NDArray[np.float64]
 _MAX_HAMMING, _RATIO = 64, 0.8
+_MIN_CONSISTENT = 0.7  # of all matches
 _NOMINAL_DEPTH = 10.0  # median depth of the first map: its scale is free, this keeps numbers of order one
 
 
@@ -45,15 +46,14 @@ def map_from_two_views(
     pixels_a, pixels_b = first.pixels[pairs[:, 0]], second.pixels[pairs[:, 1]]
     first_from_second = _relative_pose(camera, pixels_a, pixels_b, settings.seed)
     points = triangulate(camera, Pose.identity(), pixels_a, first_from_second, pixels_b)
-    good = (
-        is_consistent(camera, Pose.identity(), points, pixels_a, first.sigmas_px[pairs[:, 0]])
-        & is_consistent(camera, first_from_second, points, pixels_b, second.sigmas_px[pairs[:, 1]])
-        & (
-            parallax_rad(points, np.zeros(3), first_from_second.translation_m)
-            > settings.mapping.min_parallax_px / camera.fx_px
-        )
-    )
-    if good.sum() < settings.initialisation.min_points or good.sum() < 0.3 * len(pairs):
+    consistent = is_consistent(
+        camera, Pose.identity(), points, pixels_a, first.sigmas_px[pairs[:, 0]]
+    ) & is_consistent(camera, first_from_second, points, pixels_b, second.sigmas_px[pairs[:, 1]])
+    parallax = parallax_rad(points, np.zeros(3), first_from_second.translation_m)
+    good = consistent & (parallax > settings.mapping.min_parallax_px / camera.fx_px)
+    # Far matches show no parallax, but bear witness. To wait until most show some would be wrong: matches thin
+    # out on the way, and then the second solution of a plane wins, which shows parallax everywhere.
+    if good.sum() < settings.initialisation.min_points or consistent.sum() < _MIN_CONSISTENT * len(pairs):
         return None
     scale = _NOMINAL_DEPTH / float(np.median(points[good, 2]))
     return TwoViewMap(

@@ -7,9 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fleetmap.camera import Camera
 from fleetmap.geometry import Pose, rotation_angle_rad, so3_exp
+from fleetmap.simulation.driving import drive_along
 from fleetmap.simulation.look import Look
+from fleetmap.simulation.recording import simulate_drive
 from fleetmap.simulation.rendering import render
+from fleetmap.simulation.street import build_street
 from fleetmap.vision.features import FeatureExtractor, FeatureSettings
 from fleetmap_mapper.initialisation import TwoViewMap, map_from_two_views, match_two_views
 from fleetmap_mapper.settings import MapperSettings
@@ -65,3 +69,23 @@ def test_a_standing_camera_makes_no_map(two_views):
 
 def test_a_step_too_small_for_depth_makes_no_map(two_views):
     assert two_views(Pose(np.eye(3), np.array([0.0, 0.0, 0.02]))) is None
+
+
+def test_forward_motion_is_not_mistaken_for_its_planar_twin():
+    """Where facades and road dominate, a plane's second solution fits late views as well as the true one."""
+    street = build_street(3, 60.0)
+    camera = Camera(512, 256, 330.0, 330.0, 255.5, 127.5)
+    truth = drive_along(street, seed=1)
+    drive = simulate_drive(street, camera=camera, trajectory=truth)
+    extractor = FeatureExtractor(camera, FeatureSettings(count=4000))
+    first = extractor.extract(drive.frame(0).image)
+    for later in range(1, 8):
+        second = extractor.extract(drive.frame(later).image)
+        start = map_from_two_views(camera, first, second, match_two_views(first, second), MapperSettings())
+        if start is not None:
+            break
+    assert start is not None
+    motion = drive.map_from_cam(0).inverse() @ drive.map_from_cam(later)
+    direction = start.first_from_second.translation_m / np.linalg.norm(start.first_from_second.translation_m)
+    assert np.degrees(np.arccos(direction @ motion.translation_m / np.linalg.norm(motion.translation_m))) < 5.0
+    assert np.degrees(rotation_angle_rad(start.first_from_second.rotation.T @ motion.rotation)) < 1.0

@@ -53,11 +53,8 @@ def test_a_landmarks_descriptor_is_one_of_its_own_with_octave_and_distance(surve
     for k in range(len(content.keyframes)):
         features = extractor.extract(survey_drive.images[index_of[int(content.keyframes.stamps_ns[k])]].image)
         rows = np.flatnonzero(observations.keyframe_index == k)
-        offsets = features.pixels[None] - observations.pixels[rows][:, None]
-        nearest = np.abs(offsets).max(axis=2) + 10.0 * (
-            features.octaves[None] != observations.octaves[rows][:, None]
-        )
-        feature = nearest.argmin(axis=1)
+        places = cKDTree(np.column_stack([features.pixels, 10.0 * features.octaves]))
+        _, feature = places.query(np.column_stack([observations.pixels[rows], 10.0 * observations.octaves[rows]]))
         ids = observations.landmark_index[rows]
         away = np.linalg.norm(landmarks.points_m[ids] - content.keyframes.positions_m[k], axis=1)
         found[ids] |= (
