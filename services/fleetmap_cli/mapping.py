@@ -13,7 +13,7 @@ from fleetmap import __version__
 from fleetmap.drives import open_drive
 from fleetmap.drives.opening import find_mcap
 from fleetmap.errors import InputError
-from fleetmap.manifest import Manifest, Provenance
+from fleetmap.manifest import Manifest, Provenance, check_map_id
 from fleetmap.map_package import check_target, open_package, write_package
 from fleetmap.trajectory import write_trajectory
 from fleetmap_cli.progress import StageBar
@@ -49,6 +49,7 @@ def map_recording(
     """
     check_target(output, force)
     identity = map_id or map_id_from(output.resolve().name)
+    check_map_id(identity)
     drive = open_drive(
         recording,
         image_topic=choice.image_topic,

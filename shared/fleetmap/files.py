@@ -16,7 +16,7 @@ from fleetmap.errors import OutputExistsError, StorageError
 def atomic_path(target: Path) -> Iterator[Path]:
     """A sibling path to write a file or folder at; it becomes ``target`` when the block ends without error.
 
-    An existing target is replaced; on an error (also KeyboardInterrupt) it stays as it was and the sibling
+    An existing target of the same kind is replaced; on an error (also KeyboardInterrupt) it stays as it was and the sibling
     is removed.
 
     Raises:
@@ -54,8 +54,8 @@ def refuse_existing(target: Path, force: bool) -> None:
 
 def _replace(draft: Path, target: Path) -> None:
     """Rename over; a folder cannot be renamed over a folder, so the old one steps aside first."""
-    if not (target.is_dir() and not target.is_symlink()):
-        draft.replace(target)
+    if not (draft.is_dir() and target.is_dir() and not target.is_symlink()):
+        draft.replace(target)  # a file never takes a folder's place: the system refuses
         return
     aside = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.old")
     target.replace(aside)

@@ -56,6 +56,15 @@ def test_a_file_in_the_way_of_a_folder_is_a_storage_error(tmp_path):
         write_bytes_atomically(tmp_path / "file" / "a.txt", b"")
 
 
+def test_a_file_never_takes_a_folders_place(tmp_path):
+    (tmp_path / "results").mkdir()
+    (tmp_path / "results" / "a.txt").write_text("precious")
+    with pytest.raises(StorageError, match="cannot write .*results: "):
+        write_bytes_atomically(tmp_path / "results", b"")
+    assert (tmp_path / "results" / "a.txt").read_text() == "precious"
+    assert [path.name for path in tmp_path.iterdir()] == ["results"]
+
+
 def test_folders_appear_and_are_replaced_whole(tmp_path):
     target = tmp_path / "map"
     for content in ("first", "second"):

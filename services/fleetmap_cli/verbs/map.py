@@ -15,13 +15,14 @@ from fleetmap_cli.watching import stop_on_signals, watch_folder
 from fleetmap_mapper.settings import GnssGroup, GnssMode, MapperSettings
 
 _PATH = click.Path(path_type=Path)
+_FILE = click.Path(path_type=Path, dir_okay=False)
 _UNFIT = 3
 
 
 @click.command("map")
 @click.argument("recording", type=_PATH, required=False)
 @click.option("--output", type=_PATH, metavar="FOLDER", help="Write the map package here.")
-@click.option("--trajectory", type=_PATH, metavar="OUT.tum", help="Write the pose of every image (TUM text, UTM).")
+@click.option("--trajectory", type=_FILE, metavar="OUT.tum", help="Write the pose of every image (TUM text, UTM).")
 @click.option(
     "--gnss",
     type=click.Choice(["none", "final", "full"]),
@@ -38,7 +39,9 @@ _UNFIT = 3
     type=XYZ,
     help="Antenna from the camera centre in metres: forward, left, up; used where the recording does not say.",
 )
-@click.option("--seed", type=int, default=0, show_default=True, help="Of everything that draws at random.")
+@click.option(
+    "--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True, help="Of all random draws."
+)
 @click.option("--force", is_flag=True, help="Replace an existing output.")
 @click.option("--watch", type=_PATH, metavar="DIR", help="Map and publish every drive dropped into this folder.")
 @click.option(
