@@ -28,7 +28,8 @@ class StageBar:
         """Show that ``done`` of ``total`` steps of a stage are finished."""
         if stage != self._stage or self._bar is None:
             self._close(complete=True)
-            bar: tqdm[Any] = tqdm(total=total, desc=stage, file=sys.stderr)
+            # disable=None: no bar where stderr is a file or a pipe
+            bar: tqdm[Any] = tqdm(total=total, desc=stage, file=sys.stderr, disable=None)
             self._bar, self._stage = bar, stage
         self._bar.update(done - self._bar.n)
 

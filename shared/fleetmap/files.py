@@ -16,8 +16,8 @@ from fleetmap.errors import OutputExistsError, StorageError
 def atomic_path(target: Path) -> Iterator[Path]:
     """A sibling path to write a file or folder at; it becomes ``target`` when the block ends without error.
 
-    An existing target of the same kind is replaced; on an error (also KeyboardInterrupt) it stays as it was and the sibling
-    is removed.
+    An existing target of the same kind is replaced; on an error (also KeyboardInterrupt) it stays as it was and
+    the sibling is removed.
 
     Raises:
         StorageError: the disk is full or refuses.

@@ -59,7 +59,7 @@ def test_a_file_in_the_way_of_a_folder_is_a_storage_error(tmp_path):
 def test_a_file_never_takes_a_folders_place(tmp_path):
     (tmp_path / "results").mkdir()
     (tmp_path / "results" / "a.txt").write_text("precious")
-    with pytest.raises(StorageError, match="cannot write .*results: "):
+    with pytest.raises(StorageError, match=r"cannot write .*results: "):
         write_bytes_atomically(tmp_path / "results", b"")
     assert (tmp_path / "results" / "a.txt").read_text() == "precious"
     assert [path.name for path in tmp_path.iterdir()] == ["results"]
