@@ -20,7 +20,7 @@ from fleetmap_mapper.triangulation import is_consistent, parallax_rad, triangula
 
 Array = NDArray[np.float64]
 _MAX_HAMMING, _RATIO = 64, 0.8
-_MIN_CONSISTENT = 0.7  # of all matches
+_MIN_CONSISTENT = 0.6  # of all matches: moving traffic may own the rest
 _NOMINAL_DEPTH = 10.0  # median depth of the first map: its scale is free, this keeps numbers of order one
 
 

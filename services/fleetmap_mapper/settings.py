@@ -49,10 +49,10 @@ class KeyframeGroup(_Group):
 class MappingGroup(_Group):
     """How a new keyframe extends and tightens the map."""
 
-    neighbours: int = 8  # keyframes that new landmarks are triangulated with
+    neighbours: int = 12  # keyframes that new landmarks are triangulated with
     min_parallax_px: float = 10.0  # angle between the rays, expressed at the image centre
     max_hamming: int = 60
-    window: int = 12  # keyframes that the local adjustment moves
+    window: int = 16  # keyframes that the local adjustment moves
     min_observations: int = 3  # a landmark that never gets there is dropped
 
 
