@@ -44,6 +44,7 @@ def is_trustworthy(fit: Fit, camera: Camera, settings: GateSettings) -> bool:
     return bool(
         answer.inlier_count >= settings.min_inliers
         and answer.inlier_count >= settings.min_inlier_ratio * len(fit.matched_px)
+        and answer.inlier_count >= settings.min_seen_ratio * len(fit.predicted_px)
         and np.count_nonzero(agreeing) >= settings.min_occupied_cells
         and _coverage(fit, agreeing, camera) >= settings.min_coverage
         and position_sigma_m <= settings.max_position_sigma_m

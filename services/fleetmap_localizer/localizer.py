@@ -88,15 +88,23 @@ class Localizer:
         best = None
         for radii_px in settings.radii_px:
             fit = self._fit(features, predicted, radii_px)
-            if (
-                fit is not None
-                and is_trustworthy(fit, self._camera, settings.gate)
-                and motion.can_reach(stamp_ns, fit.answer.map_from_cam, settings)
-            ):
+            if fit is not None and self._continues(motion, stamp_ns, fit):
                 best = _stronger(best, fit.answer)
             if best is not None and not self._lost_support(best, motion):
                 break
         return best
+
+    def _continues(self, motion: Motion, stamp_ns: int, fit: Fit) -> bool:
+        """Whether a pose near the prediction is its continuation.
+
+        Where most of the support is gone the view may be of something else: as much is asked as from nothing.
+        """
+        settings = self._settings.tracking
+        vouched = fit.answer.inlier_count >= settings.min_vouched_support * motion.inlier_count
+        gate = settings.gate if vouched else self._settings.relocalization.gate
+        return is_trustworthy(fit, self._camera, gate) and motion.can_reach(
+            stamp_ns, fit.answer.map_from_cam, settings
+        )
 
     def _lost_support(self, answer: AbsolutePose, motion: Motion | None) -> bool:
         """Whether far fewer landmarks agree than on the image before.
@@ -120,9 +128,15 @@ class Localizer:
         best = best_unrivalled(fits, settings.max_rival)
         if best is None or not is_trustworthy(best, self._camera, settings.gate):
             return None
-        if motion and not motion.can_reach(stamp_ns, best.answer.map_from_cam, self._settings.tracking):
+        if motion and not self._fits_in(motion, stamp_ns, best.answer):
             return None
         return best.answer
+
+    def _fits_in(self, motion: Motion, stamp_ns: int, answer: AbsolutePose) -> bool:
+        """Whether the vehicle can have got there, or far more speaks for this place than for the one before."""
+        settings = self._settings.tracking
+        overruled = answer.inlier_count > settings.overruling_support * motion.inlier_count
+        return overruled or motion.can_reach(stamp_ns, answer.map_from_cam, settings)
 
     def _candidate_places(self, features: Features) -> list[Indices]:
         """Landmarks of the likeliest places, best first; no keyframe stands for two of them."""
@@ -199,7 +213,10 @@ class Localizer:
         if answer is None:
             return
         pose, inliers = answer.map_from_cam, answer.inlier_count
-        self._motion = motion.follow(stamp_ns, pose, inliers) if motion else Motion(stamp_ns, pose, inliers)
+        if motion and motion.can_reach(stamp_ns, pose, self._settings.tracking):
+            self._motion = motion.follow(stamp_ns, pose, inliers)
+        else:
+            self._motion = Motion(stamp_ns, pose, inliers)
 
 
 def _stronger(first: AbsolutePose | None, second: AbsolutePose | None) -> AbsolutePose | None:

@@ -22,6 +22,7 @@ class GateSettings:
     """What a pose must show before it is believed: no pose is better than a wrong one."""
 
     min_inliers: int
+    min_seen_ratio: float  # inliers per landmark that should be in view; does not depend on the map's density
     min_coverage: float  # share of the view's cells, where landmarks are expected, in which some agree
     max_position_sigma_m: float
     max_rotation_sigma_deg: float = 1.0
@@ -44,7 +45,9 @@ class RelocalizationSettings:
     ransac_error_px: float = 6.0
     radii_px: tuple[float, ...] = (12.0, 5.0)  # windows around the projections, round after round
     max_rival: float = 0.8  # another place with this share of the best's inliers makes the answer ambiguous
-    gate: GateSettings = GateSettings(min_inliers=20, min_coverage=0.55, max_position_sigma_m=0.2)
+    gate: GateSettings = GateSettings(
+        min_inliers=20, min_seen_ratio=0.03, min_coverage=0.55, max_position_sigma_m=0.2
+    )
 
 
 @dataclass(frozen=True)
@@ -59,8 +62,12 @@ class TrackingSettings:
     max_acceleration_mps2: float = 15.0  # a pose that the vehicle cannot have reached is not believed
     max_speed_mps: float = 80.0
     slack_m: float = 0.5
+    min_vouched_support: float = 0.35  # of the inliers before; with fewer, the prediction vouches for nothing
+    overruling_support: float = 2.0  # times the inliers before; a pose with more is believed against the motion
     # Looser: a prediction from images before vouches for the place, and traffic may hide half the view.
-    gate: GateSettings = GateSettings(min_inliers=15, min_coverage=0.3, max_position_sigma_m=0.3)
+    gate: GateSettings = GateSettings(
+        min_inliers=15, min_seen_ratio=0.015, min_coverage=0.3, max_position_sigma_m=0.3
+    )
 
 
 @dataclass(frozen=True)

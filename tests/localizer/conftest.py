@@ -54,7 +54,7 @@ class MappedStreet:
 
 @pytest.fixture(scope="session")
 def street() -> Street:
-    return build_street(3, 45.0)
+    return build_street(3, 36.0)
 
 
 @pytest.fixture(scope="session")
@@ -77,7 +77,7 @@ def second_drive(street: Street) -> SecondDrive:
 @pytest.fixture(scope="session")
 def foreign_drive() -> SecondDrive:
     """A street of the same kind that no map shows."""
-    return drive_through(build_street(11, 30.0), lane_offset_m=0.0, start_m=0.0)
+    return drive_through(build_street(11, 22.0), lane_offset_m=0.0, start_m=0.0)
 
 
 def drive_through(street: Street, *, lane_offset_m: float, start_m: float) -> SecondDrive:
@@ -156,7 +156,7 @@ def _quality(visual_map: VisualMap) -> Quality:
         keyframes=len(visual_map.keyframes),
         landmarks=len(visual_map.landmarks),
         observations=len(visual_map.observations),
-        length_m=45.0,
+        length_m=36.0,
         frames_total=len(visual_map.keyframes),
         frames_posed=len(visual_map.keyframes),
         reprojection_rms_px=0.5,

@@ -13,7 +13,7 @@ from fleetmap_localizer.gate import Fit, best_unrivalled, is_trustworthy
 from fleetmap_localizer.settings import GateSettings
 
 CAMERA = Camera(800, 400, 500.0, 500.0, 399.5, 199.5)
-SETTINGS = GateSettings(min_inliers=20, min_coverage=0.5, max_position_sigma_m=0.2)
+SETTINGS = GateSettings(min_inliers=20, min_seen_ratio=0.025, min_coverage=0.5, max_position_sigma_m=0.2)
 EVERYWHERE = np.stack(np.meshgrid(np.arange(5, 800, 20.0), np.arange(5, 400, 20.0)), axis=-1).reshape(-1, 2)
 
 
@@ -45,6 +45,12 @@ def test_too_few_inliers_or_too_many_outliers_are_not() -> None:
     assert not trusted(fit(EVERYWHERE[::44]))
     assert trusted(fit(EVERYWHERE[::10], outliers=70))
     assert not trusted(fit(EVERYWHERE[::10], outliers=90))
+
+
+def test_few_of_many_expected_landmarks_are_not_trusted() -> None:
+    expected = np.repeat(EVERYWHERE, 4, axis=0)
+    assert trusted(fit(EVERYWHERE[::10], predicted_px=expected))
+    assert not trusted(fit(EVERYWHERE[::11], predicted_px=expected))
 
 
 def test_a_copy_of_one_house_is_not_trusted_however_many_points_it_has() -> None:
