@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,11 +14,16 @@ import pytest
 from numpy.typing import NDArray
 
 from fleetmap.camera import Camera
+from fleetmap.drive import Frame, GnssFix
+from fleetmap.drives import open_drive
+from fleetmap.drives.ros2_writer import DriveWriter
 from fleetmap.geometry import rotation_angle_rad
 from fleetmap.simulation.driving import drive_along
 from fleetmap.simulation.recording import record_drive
 from fleetmap.simulation.street import Street, build_street
 from fleetmap.trajectory import Trajectory
+
+FLEETMAP = [sys.executable, "-c", "from fleetmap_cli.main import main; main()"]
 
 
 @pytest.fixture(scope="session")
@@ -68,3 +76,51 @@ def survey(tmp_path_factory: pytest.TempPathFactory) -> Survey:
     recording = tmp_path_factory.mktemp("survey") / "survey.mcap"
     reference = record_drive(street, recording, camera=camera, trajectory=truth, gnss_interval_s=1.0, seed=2)
     return Survey(street, recording, reference, truth)
+
+
+@dataclass(frozen=True)
+class MappedSurvey:
+    """What ``fleetmap map`` made of the survey drive in a process of its own."""
+
+    package: Path
+    trajectory: Path
+    run: subprocess.CompletedProcess[str]
+
+
+@pytest.fixture(scope="session")
+def mapped_survey(survey: Survey, tmp_path_factory: pytest.TempPathFactory) -> MappedSurvey:
+    """The survey drive mapped as a user does it."""
+    folder = tmp_path_factory.mktemp("maps")
+    package, trajectory = folder / "my_map", folder / "survey.tum"
+    arguments = ["map", str(survey.recording), "--output", str(package), "--trajectory", str(trajectory)]
+    run = subprocess.run([*FLEETMAP, *arguments], capture_output=True, text=True, timeout=300, check=False)
+    return MappedSurvey(package, trajectory, run)
+
+
+@pytest.fixture(scope="session")
+def survey_frames(survey: Survey) -> tuple[Frame, ...]:
+    """The decoded images of the survey drive."""
+    return tuple(open_drive(survey.recording).frames())
+
+
+@pytest.fixture(scope="session")
+def write_drive(survey: Survey) -> Callable[..., Path]:
+    """Writes a recording of some images of the survey drive, or of others in their place."""
+
+    def write(
+        path: Path,
+        frames: Iterable[Frame],
+        *,
+        fixes: Iterable[GnssFix] | None = None,
+        calibrated: bool = True,
+        gnss_frame_id: str = "camera",
+    ) -> Path:
+        drive = open_drive(survey.recording)
+        with DriveWriter(path, drive.camera if calibrated else None) as writer:
+            for frame in frames:
+                writer.write_image(frame.stamp_ns, frame.image)
+            for fix in drive.gnss_fixes() if fixes is None else fixes:
+                writer.write_fix(fix, gnss_frame_id)
+        return path
+
+    return write

@@ -142,9 +142,9 @@ class DriveInMemory:
 
 
 @pytest.fixture(scope="session")
-def survey_drive(survey: Any) -> DriveInMemory:
+def survey_drive(survey: Any, survey_frames: tuple[Frame, ...]) -> DriveInMemory:
     drive = open_drive(survey.recording)
-    return DriveInMemory(drive.name, drive.camera, tuple(drive.frames()), tuple(drive.gnss_fixes()))
+    return DriveInMemory(drive.name, drive.camera, survey_frames, tuple(drive.gnss_fixes()))
 
 
 @pytest.fixture(scope="session")
