@@ -29,9 +29,9 @@ from fleetmap_cli.demo_processes import interrupted_once, run_verb, running_map_
 from fleetmap_cli.plotting import require_picture_name
 
 SURVEY_CAMERA = Camera(1024, 384, 600.0, 600.0, 511.5, 191.5)
-SECOND_CAMERA = Camera(960, 540, 700.0, 698.0, 486.0, 262.0, (-0.2, 0.06, 5e-4, -3e-4, 0.0))
+SECOND_CAMERA = Camera(800, 450, 585.0, 583.5, 405.0, 218.0, (-0.2, 0.06, 5e-4, -3e-4, 0.0))
 SECOND_LOOK = Look(exposure=0.75, gamma=1.3, noise_sigma=3.0, blur_sigma_px=0.7)
-SURVEY_SPEED_MPS, SECOND_SPEED_MPS = 8.0, 10.0
+SURVEY_SPEED_MPS, SECOND_SPEED_MPS = 8.0, 11.0
 OTHER_LANE_M = 3.5  # to the left
 GNSS_INTERVAL_S = 3.0
 FEWEST_INTERVALS = 6  # on a short street fixes come oftener: two or three would not place a map

@@ -75,7 +75,7 @@ def test_the_demonstration_maps_a_street_and_localises_a_second_vehicle_in_it(
     compared = re.findall(r"^  coverage: (\d+) of (\d+) poses compared", done.stdout, re.MULTILINE)
     assert [int(count) / int(total) for count, total in compared] == [1.0, pytest.approx(1.0, abs=0.05)]
     assert int(compared[0][1]) >= 50
-    assert int(compared[1][1]) >= 40
+    assert int(compared[1][1]) >= 30
     assert re.search(r"^my_map: EPSG:32632, .* 40 m, \d{4,} landmarks, ", done.stdout, re.MULTILINE)  # over HTTP
     assert "render survey.mcap: 100%" in done.stderr
 
