@@ -17,7 +17,7 @@ from fleetmap_server.catalogue import Catalogue, LonLatBox
 from fleetmap_server.problems import IncompleteUploadError, NotFoundError
 from fleetmap_server.store import BlobStore, storage_error
 
-_MAPS_PER_PAGE, _PAGE_BYTES = 50, 1024 * 1024
+_MAPS_PER_PAGE, _PAGE_BYTES = 50, 512 * 1024
 _MISSING_PER_ANSWER = 2000
 _RESERVE_BYTES = 32 * 1024 * 1024  # left on the disk for the catalogue
 

@@ -52,8 +52,8 @@ def _handlers(library: MapLibrary) -> dict[str, Handler]:
         return library.begin(request.version, request.size_bytes)
 
     def receive(request: protocol.UploadChunkRequest, payload: bytes) -> BaseModel:
-        if not 0 < len(payload) <= protocol.CHUNK_BYTES:
-            raise BadRequestError(f"a chunk has 1 to {protocol.CHUNK_BYTES} bytes, not {len(payload)}")
+        if not 0 < len(payload) <= protocol.UPLOAD_CHUNK_BYTES:
+            raise BadRequestError(f"a chunk has 1 to {protocol.UPLOAD_CHUNK_BYTES} bytes, not {len(payload)}")
         received = library.receive(request.version, request.sha256, request.size_bytes, request.offset, payload)
         return protocol.Received(received_bytes=received)
 

@@ -6,6 +6,8 @@ import socket
 
 import pytest
 
+from fleetmap_server.library import open_library
+
 
 def test_help_says_what_it_does_with_its_defaults(fleetmap):
     code, out, _ = fleetmap("serve", "--help")
@@ -39,8 +41,9 @@ def test_a_port_in_use_is_one_line(fleetmap, tmp_path, absent_server):
     assert err == f"error: cannot serve HTTP on {address}: Address already in use; is a server running already?\n"
 
 
-def test_a_second_server_on_the_same_store_is_one_line(fleetmap, tmp_path, map_server, absent_server):
+def test_a_second_server_on_the_same_store_is_one_line(fleetmap, tmp_path, absent_server):
     store = tmp_path / "store"
-    code, out, err = fleetmap("serve", "--store", store, "--zenoh", absent_server, "--http", "127.0.0.1:0")
+    with open_library(store):
+        code, out, err = fleetmap("serve", "--store", store, "--zenoh", absent_server, "--http", "127.0.0.1:0")
     assert (code, out) == (1, "")
     assert err == f"error: another map server uses the store {store}; stop it or give another --store\n"

@@ -17,9 +17,9 @@ import pytest
 
 from fleetmap.errors import StorageError, TransferError
 from fleetmap.transport import MapClient
-from fleetmap.transport.protocol import CHUNK_BYTES
 
-CUT_BYTES = 3 * CHUNK_BYTES
+MIB = 1024 * 1024
+CUT_BYTES = 3 * MIB
 
 
 def once_past(limit_bytes: int, act: Callable[[], object]) -> Callable[[int, int], None]:
@@ -94,7 +94,7 @@ def port_of(endpoint: str) -> int:
 def test_a_server_killed_during_an_upload_costs_one_clear_error_and_only_the_missing_is_sent_again(
     start_server, tmp_path, endpoint, make_map
 ):
-    original = make_map(part_sizes=(2 * CHUNK_BYTES, 6 * CHUNK_BYTES))
+    original = make_map(part_sizes=(2 * MIB, 6 * MIB))
     server = start_server(tmp_path, endpoint)
     with MapClient(endpoint, patience_s=1.0) as client:
         begun_s = time.monotonic()
@@ -117,7 +117,7 @@ def test_a_server_killed_during_an_upload_costs_one_clear_error_and_only_the_mis
 
 
 def test_an_upload_outlives_a_restart_of_the_server(start_server, tmp_path, endpoint, make_map):
-    original = make_map(part_sizes=(6 * CHUNK_BYTES,))
+    original = make_map(part_sizes=(6 * MIB,))
     server = start_server(tmp_path, endpoint)
 
     def restart() -> None:
@@ -130,7 +130,7 @@ def test_an_upload_outlives_a_restart_of_the_server(start_server, tmp_path, endp
 
 
 def test_a_server_killed_during_a_download_costs_one_clear_error(start_server, tmp_path, endpoint, make_map):
-    original = make_map(part_sizes=(16 * CHUNK_BYTES,))
+    original = make_map(part_sizes=(16 * MIB,))
     ((sha256, data),) = original.parts.items()
     server = start_server(tmp_path, endpoint)
     with MapClient(endpoint) as client:
@@ -153,7 +153,7 @@ def test_a_server_killed_during_a_download_costs_one_clear_error(start_server, t
 
 
 def test_a_cut_connection_costs_a_retry_and_no_data(server, make_map):
-    original = make_map(part_sizes=(16 * CHUNK_BYTES,))
+    original = make_map(part_sizes=(16 * MIB,))
     ((sha256, data),) = original.parts.items()
     proxy = CuttingProxy(port_of(server.zenoh_endpoint), CUT_BYTES, lambda: proxy.cut())
     with MapClient(proxy.endpoint) as client:
@@ -175,7 +175,7 @@ MapClient(endpoint).publish(open(manifest, "rb").read(), lambda sha256: open(par
 
 
 def test_a_client_killed_in_mid_upload_goes_on_where_it_stopped(server, make_map, tmp_path):
-    original = make_map(part_sizes=(6 * CHUNK_BYTES,))
+    original = make_map(part_sizes=(6 * MIB,))
     ((_, data),) = original.parts.items()
     (tmp_path / "manifest").write_bytes(original.manifest_bytes)
     (tmp_path / "part").write_bytes(data)
@@ -192,7 +192,7 @@ def test_a_client_killed_in_mid_upload_goes_on_where_it_stopped(server, make_map
 
 
 def test_a_full_disk_is_told_and_the_upload_goes_on_once_there_is_room(start_server, tmp_path, endpoint, make_map):
-    original = make_map(part_sizes=(5 * CHUNK_BYTES,))
+    original = make_map(part_sizes=(5 * MIB,))
     server = start_server(tmp_path, endpoint)
     _, hard = resource.prlimit(server.process.pid, resource.RLIMIT_FSIZE)
     resource.prlimit(server.process.pid, resource.RLIMIT_FSIZE, (CUT_BYTES, hard))

@@ -11,7 +11,8 @@ from fleetmap.catalogue import MapEntry
 from fleetmap.errors import InputError, MapPackageError, ServerRefusedError
 from fleetmap.manifest import parse_manifest
 from fleetmap.transport import MapClient
-from fleetmap.transport.protocol import CHUNK_BYTES
+
+MIB = 1024 * 1024
 
 
 def fetch(client: MapClient, map_id: str) -> tuple[bytes, dict[str, bytes]]:
@@ -22,7 +23,7 @@ def fetch(client: MapClient, map_id: str) -> tuple[bytes, dict[str, bytes]]:
 
 
 def test_a_published_map_is_listed_and_comes_back_byte_for_byte(server, make_map):
-    sizes = (3 * CHUNK_BYTES + 17, CHUNK_BYTES, 2 * CHUNK_BYTES, 1, 9 * CHUNK_BYTES)
+    sizes = (3 * MIB + 17, MIB, 2 * MIB, 1, 9 * MIB)
     original = make_map(part_sizes=sizes)
     with MapClient(server.zenoh_endpoint) as client:
         assert client.list_maps() == []

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import pytest
 
 from fleetmap.transport import MapClient
-from fleetmap.transport.protocol import CHUNK_BYTES
+from fleetmap.transport.protocol import UPLOAD_CHUNK_BYTES
 from fleetmap.transport.session import Connection, ProblemError
 from fleetmap_server.server import running_server
 from fleetmap_server.settings import ServerSettings
@@ -68,14 +68,14 @@ def test_a_malformed_request_is_answered_with_a_problem(connection, operation, p
 
 
 def test_chunks_are_taken_up_to_their_limit(connection):
-    place = {"version": HASH, "sha256": HASH, "size_bytes": 5 * CHUNK_BYTES, "offset": 0}
-    status, detail = problem(connection, "upload/chunk", bytes(CHUNK_BYTES + 1), **place)
-    assert (status, f"1 to {CHUNK_BYTES} bytes" in detail) == (400, True)
+    place = {"version": HASH, "sha256": HASH, "size_bytes": 5 * UPLOAD_CHUNK_BYTES, "offset": 0}
+    status, detail = problem(connection, "upload/chunk", bytes(UPLOAD_CHUNK_BYTES + 1), **place)
+    assert (status, f"1 to {UPLOAD_CHUNK_BYTES} bytes" in detail) == (400, True)
     assert problem(connection, "upload/chunk", None, **place)[0] == 400
     answer = connection.ask(
-        "upload/chunk", {k: str(v) for k, v in place.items()}, bytes(CHUNK_BYTES), 10.0
+        "upload/chunk", {k: str(v) for k, v in place.items()}, bytes(UPLOAD_CHUNK_BYTES), 10.0
     ).answer()
-    assert json.loads(answer) == {"received_bytes": CHUNK_BYTES}
+    assert json.loads(answer) == {"received_bytes": UPLOAD_CHUNK_BYTES}
 
 
 def test_a_tampered_chunk_is_refused_and_leaves_nothing(connection, standing_server, make_map):

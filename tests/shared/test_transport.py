@@ -12,11 +12,11 @@ import pytest
 
 from fleetmap.errors import InputError, RunError, ServerRefusedError, ServerUnreachableError, TransferError
 from fleetmap.transport import MapClient, check_endpoint
-from fleetmap.transport.protocol import CHUNK_BYTES, Problem
+from fleetmap.transport.protocol import CHUNK_BYTES, UPLOAD_CHUNK_BYTES, WINDOW_CHUNKS, Problem
 from fleetmap.transport.service import Handler, RequestService
 
 HELLO = b'{"service": "test", "protocol": 1, "fleetmap_version": "0"}'
-DATA = bytes(range(256)) * 5000  # two chunks
+DATA = bytes(range(256)) * 5000  # five chunks
 NAME = hashlib.sha256(DATA).hexdigest()
 
 
@@ -94,7 +94,7 @@ def test_an_endpoint_is_listened_on_once():
         RequestService(endpoint, {}, explain)
 
 
-def test_a_part_in_two_chunks_is_put_together(connect):
+def test_a_part_in_five_chunks_is_put_together(connect):
     client = connect(chunk=lambda words, payload: DATA[int(words["offset"]) :][:CHUNK_BYTES])
     assert client.part("street", "v" * 64, NAME, len(DATA)) == DATA
 
@@ -108,6 +108,15 @@ def test_a_part_that_arrives_damaged_is_refused(connect, spoil):
     client = connect(chunk=lambda words, payload: spoil(DATA[int(words["offset"]) :][:CHUNK_BYTES]))
     with pytest.raises(TransferError, match=f"part {NAME[:12]} of map 'street' arrived damaged"):
         client.part("street", "v" * 64, NAME, len(DATA))
+
+
+def test_what_is_on_its_way_at_once_fits_the_transmit_queue():
+    def batches(size_bytes: int) -> int:
+        return -(-(size_bytes + 2048) // 65_000)  # of 65535 bytes, each with its fragment's header
+
+    assert batches(CHUNK_BYTES) * WINDOW_CHUNKS <= 16
+    assert batches(UPLOAD_CHUNK_BYTES) <= 16
+    assert UPLOAD_CHUNK_BYTES <= 1024 * 1024
 
 
 def test_an_exception_in_a_handler_is_an_answer(connect):

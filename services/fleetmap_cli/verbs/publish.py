@@ -40,7 +40,7 @@ def publish_package(package: MapPackage, server: str) -> MapEntry:
     """Send a package to the server at an endpoint, with a progress bar; raises as ``MapClient.publish``."""
     with (
         MapClient(server) as client,
-        tqdm(desc="publish", unit="B", unit_scale=True, unit_divisor=1000, leave=False) as bar,
+        tqdm(desc="publish", unit="B", unit_scale=True, unit_divisor=1000, leave=False, disable=None) as bar,
     ):
 
         def show(done_bytes: int, total_bytes: int) -> None:

@@ -16,6 +16,8 @@ from fleetmap.transport.link import Parameters, PendingRequest, ServerLink
 from fleetmap.transport.protocol import (
     CHUNK_BYTES,
     DEFAULT_ENDPOINT,
+    UPLOAD_CHUNK_BYTES,
+    WINDOW_CHUNKS,
     BlobTicket,
     MissingBlob,
     Received,
@@ -23,7 +25,6 @@ from fleetmap.transport.protocol import (
 )
 from fleetmap.transport.session import NoAnswerError
 
-_WINDOW = 4  # chunks asked for at once
 _MAX_FRUITLESS_CHUNKS = 3  # sent in a row without the server having more of the blob
 
 Progress = Callable[[int, int], None]  # bytes done, bytes in total
@@ -157,7 +158,7 @@ class MapClient:
         blob = {"version": version, "sha256": sha256}
         window: deque[PendingRequest] = deque()
         for offset in range(0, size_bytes, CHUNK_BYTES):
-            if len(window) == _WINDOW:
+            if len(window) == WINDOW_CHUNKS:
                 yield window.popleft().finish()
             window.append(self._link.start(protocol.CHUNK, {**blob, "offset": offset}))
         while window:
@@ -218,7 +219,9 @@ class _Upload:
         offset, fruitless, before_bytes = blob.received_bytes, 0, self.done_bytes - blob.received_bytes
         while offset < len(data) and fruitless < _MAX_FRUITLESS_CHUNKS:
             place: Parameters = {**named, "offset": offset}
-            answer = self._link.start(protocol.UPLOAD_CHUNK, place, data[offset : offset + CHUNK_BYTES]).finish()
+            answer = self._link.start(
+                protocol.UPLOAD_CHUNK, place, data[offset : offset + UPLOAD_CHUNK_BYTES]
+            ).finish()
             received_bytes = self._link.read(Received, answer).received_bytes
             fruitless = 0 if received_bytes > offset else fruitless + 1
             offset = received_bytes

@@ -125,7 +125,7 @@ class ServerLink:
         while not connection.is_broken and (left_s := deadline_s - time.monotonic()) > 0.0:
             try:
                 hello = connection.ask(protocol.HELLO, {}, None, timeout_s=left_s).answer()
-            except NoAnswerError:
+            except (NoAnswerError, ProblemError):  # not there yet, or busy
                 time.sleep(_PAUSE_S)
                 continue
             self.read(protocol.Hello, hello)

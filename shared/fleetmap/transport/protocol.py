@@ -14,7 +14,7 @@ operation          parameters (payload)                answer
 ``chunk``          version sha256 offset               up to ``CHUNK_BYTES`` bytes of a blob
 ``upload/begin``   version size_bytes                  JSON ``UploadStatus``: what is still missing
 ``upload/chunk``   version sha256 size_bytes offset    JSON ``Received``
-                   (up to ``CHUNK_BYTES`` bytes)
+                   (<= ``UPLOAD_CHUNK_BYTES``)
 ``upload/commit``  version                             JSON ``MapEntry``
 =================  ==================================  ================================================
 
@@ -38,7 +38,9 @@ from fleetmap.manifest import MAX_PART_BYTES, MapId, Sha256
 PROTOCOL_VERSION = 1
 KEY_PREFIX = f"fleetmap/v{PROTOCOL_VERSION}"
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
-CHUNK_BYTES = 1024 * 1024
+CHUNK_BYTES = 256 * 1024
+WINDOW_CHUNKS = 3  # a client asks for at most so many at once: 768 KiB, which every transmit queue holds
+UPLOAD_CHUNK_BYTES = WINDOW_CHUNKS * CHUNK_BYTES  # uploads go one at a time
 PROBLEM_ENCODING = "application/problem+json"
 
 HELLO, MAPS, MANIFEST, CHUNK = "hello", "maps", "manifest", "chunk"

@@ -19,10 +19,11 @@ from pydantic import ValidationError
 from fleetmap.errors import RunError, ServerRefusedError, ServerUnreachableError, TransferError
 from fleetmap.transport import protocol
 
-# One message may wait this long for a slow link before Zenoh gives the whole connection up; the default
-# of 5 s loses 5 MiB on a link of 100 kB/s.
-# The price: about one cut connection in twenty is noticed only after this time.
-_PATIENCE_OF_LINK_US = 20_000_000
+# Batches of 64 KiB that a transmit queue may hold; 16 is Zenoh's limit. A message that finds its queue full
+# waits, and while it waits for a client that has gone the whole router may stand still. So a client asks for
+# no more at once than fits (see CHUNK_BYTES), and nothing ever waits.
+_QUEUE_BATCHES = 16
+_QUEUES = ("interactive_high", "background")
 _LOOK_UP_S = 0.2  # how often someone who waits looks whether the connection still stands
 _MAX_MESSAGE_BYTES = 8 * 1024 * 1024  # what a peer may make us buffer; chunks are far smaller
 
@@ -78,7 +79,10 @@ class Connection:
     def close(self) -> None:
         """End it; what was asked over it is not answered any more."""
         self._broken.set()
-        self._session.close()  # type: ignore[no-untyped-call]
+        try:
+            self._session.close()  # type: ignore[no-untyped-call]
+        except zenoh.ZError as error:  # it waited for a link that is dead
+            _log.debug("closing: %s", error)
 
     def ask(
         self,
@@ -179,9 +183,10 @@ def _config(settings: Mapping[str, Any]) -> zenoh.Config:
     common = {
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
+        "scouting/delay": 0,  # nothing is scouted for
         # Between processes of one machine Zenoh would go around TCP, and a killed one leave its segments behind.
         "transport/shared_memory/enabled": False,
-        "transport/link/tx/queue/congestion_control/block/wait_before_close": _PATIENCE_OF_LINK_US,
+        **{f"transport/link/tx/queue/size/{queue}": _QUEUE_BATCHES for queue in _QUEUES},
         "transport/link/rx/max_message_size": _MAX_MESSAGE_BYTES,
     }
     config = zenoh.Config()
