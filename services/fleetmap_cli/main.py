@@ -79,6 +79,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except click.ClickException as error:
         error.show()
         sys.exit(2)
+    except OSError as error:  # a disk or a permission where no room expects one, such as a compiler's cache
+        where = f"{error.filename}: " if error.filename else ""
+        click.echo(
+            f"error: {where}{error.strerror or error}; is there room on the disk, and permission?", err=True
+        )
+        sys.exit(1)
     except click.Abort:
         click.echo("interrupted", err=True)
         sys.exit(130)
