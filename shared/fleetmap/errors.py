@@ -8,7 +8,6 @@ FleetmapError
 │   ├── MapPackageError       a map package is malformed, tampered with or too new
 │   └── OutputExistsError     the output is there already and --force was not given
 └── RunError                  failed while running                        exit code 1
-    ├── MappingError          the drive could not be mapped
     ├── NoPoseError           not one frame of the whole drive could be localised
     ├── StorageError          the disk is full or refuses
     └── ServerError           what goes wrong between client and map server
@@ -54,10 +53,6 @@ class OutputExistsError(InputError):
 
 class RunError(FleetmapError):
     """The input was good, the run was not."""
-
-
-class MappingError(RunError):
-    """The drive could not be mapped."""
 
 
 class NoPoseError(RunError):

@@ -13,7 +13,7 @@ from mcap.writer import Writer
 from fleetmap.errors import (
     DriveError,
     InputError,
-    MappingError,
+    NoPoseError,
     ServerRefusedError,
     ServerUnreachableError,
     StorageError,
@@ -105,7 +105,7 @@ def test_a_drive_that_changes_between_two_looks_is_left_alone(tmp_path: Path) ->
     ("end", "status", "reason"),
     [
         (DriveError("b.mcap has no images"), "failed", "b.mcap has no images"),
-        (MappingError("not enough motion"), "failed", "not enough motion"),
+        (NoPoseError("not enough motion"), "failed", "not enough motion"),
         (ServerRefusedError("this vehicle may not publish"), "failed", "this vehicle may not publish"),
         (ZeroDivisionError("float division by zero"), "failed", "ZeroDivisionError: float division by zero"),
         (UnfitMapError("GNSS residuals of 4 m"), "unfit", "GNSS residuals of 4 m"),
