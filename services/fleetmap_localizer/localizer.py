@@ -66,9 +66,11 @@ class Localizer:
     def localize_features(self, features: Features, stamp_ns: int) -> PoseEstimate | None:
         """The same for an image whose features are known already, as when several maps are asked."""
         motion = self._recent_motion(stamp_ns)
-        answer = None if motion is None else self._track(features, stamp_ns, motion)
-        if answer is None or self._lost_support(answer, motion):
-            answer = _stronger(answer, self._relocalize(features, stamp_ns, motion))
+        answer = tracked = None if motion is None else self._track(features, stamp_ns, motion)
+        if motion is None or tracked is None or motion.is_fresh or self._lost_support(tracked, motion):
+            answer = _stronger(tracked, self._relocalize(features, stamp_ns, motion))
+        if answer and tracked and not is_same_place(answer.map_from_cam, tracked.map_from_cam):
+            motion = None  # it was the track that had been deceived
         self._remember(stamp_ns, answer, motion)
         if answer is None:
             return None
@@ -106,13 +108,13 @@ class Localizer:
             stamp_ns, fit.answer.map_from_cam, settings
         )
 
-    def _lost_support(self, answer: AbsolutePose, motion: Motion | None) -> bool:
+    def _lost_support(self, answer: AbsolutePose, motion: Motion) -> bool:
         """Whether far fewer landmarks agree than on the image before.
 
         In wide windows some landmarks always find a partner, and those may agree on a wrong pose.
         """
         kept = self._settings.tracking.min_kept_support
-        return motion is not None and answer.inlier_count < kept * motion.inlier_count
+        return answer.inlier_count < kept * motion.inlier_count
 
     def _relocalize(self, features: Features, stamp_ns: int, motion: Motion | None) -> AbsolutePose | None:
         """Search from nothing: like places, landmarks matched by descriptor alone, then by projection."""

@@ -21,6 +21,11 @@ class Motion:
     previous_stamp_ns: int | None = None
     map_from_previous: Pose | None = None
 
+    @property
+    def is_fresh(self) -> bool:
+        """Whether it rests on a single image, which another place may have deceived."""
+        return self.previous_stamp_ns is None
+
     def follow(self, stamp_ns: int, map_from_cam: Pose, inlier_count: int) -> Motion:
         """The motion after one more pose."""
         return Motion(stamp_ns, map_from_cam, inlier_count, self.stamp_ns, self.map_from_cam)
