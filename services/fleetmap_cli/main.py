@@ -72,12 +72,17 @@ def cli() -> None:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run one verb and exit with its code."""
     try:
-        code = cli.main(args=None if arguments is None else list(arguments), standalone_mode=False)
+        code = cli.main(
+            args=None if arguments is None else list(arguments), prog_name="fleetmap", standalone_mode=False
+        )
     except FleetmapError as error:
         click.echo(f"error: {error}", err=True)
         sys.exit(error.exit_code)
-    except click.ClickException as error:
+    except click.exceptions.NoArgsIsHelpError as error:
         error.show()
+        sys.exit(2)
+    except click.ClickException as error:
+        click.echo(f"error: {_one_line(error)}", err=True)
         sys.exit(2)
     except OSError as error:  # a disk or a permission where no room expects one, such as a compiler's cache
         where = f"{error.filename}: " if error.filename else ""
@@ -89,3 +94,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         click.echo("interrupted", err=True)
         sys.exit(130)
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _one_line(error: click.ClickException) -> str:
+    """What was wrong, and for wrong usage where to read how it is meant."""
+    message = " ".join(error.format_message().split())
+    if isinstance(error, click.UsageError) and error.ctx is not None:
+        return f"{message.rstrip('.')}; '{error.ctx.command_path} --help' shows how"
+    return message
