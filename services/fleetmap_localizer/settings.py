@@ -37,7 +37,7 @@ class RelocalizationSettings:
     candidates: int = 5  # places tried
     neighbours: int = 8  # covisible keyframes that join a candidate
     min_shared_landmarks: int = 15  # to call two keyframes covisible
-    max_landmarks: int = 1200  # of a candidate
+    max_landmarks: int = 800  # of a candidate
     max_distance: int = 64  # Hamming bits
     ratio: float = 0.85
     min_matches: int = 12
