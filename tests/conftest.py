@@ -22,6 +22,7 @@ from fleetmap.simulation.driving import drive_along
 from fleetmap.simulation.recording import record_drive
 from fleetmap.simulation.street import Street, build_street
 from fleetmap.trajectory import Trajectory
+from fleetmap_cli.main import main
 
 FLEETMAP = [sys.executable, "-c", "from fleetmap_cli.main import main; main()"]
 
@@ -124,3 +125,16 @@ def write_drive(survey: Survey) -> Callable[..., Path]:
         return path
 
     return write
+
+
+@pytest.fixture
+def fleetmap(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
+    """Runs ``fleetmap`` with arguments: exit code, stdout, stderr."""
+
+    def call(*arguments: object) -> tuple[int, str, str]:
+        with pytest.raises(SystemExit) as done:
+            main([str(argument) for argument in arguments])
+        out, err = capsys.readouterr()
+        return int(done.value.code or 0), out, err
+
+    return call

@@ -1,4 +1,4 @@
-"""The command line in this process, and a map server in another."""
+"""A map package, and a map server in another process."""
 
 from __future__ import annotations
 
@@ -8,27 +8,12 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from fleetmap_cli.main import main
-
 GOLDEN_PACKAGE = Path(__file__).parents[1] / "shared" / "golden" / "map_format_1"
-
-
-@pytest.fixture
-def fleetmap(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
-    """Runs ``fleetmap`` with arguments: exit code, stdout, stderr."""
-
-    def call(*arguments: object) -> tuple[int, str, str]:
-        with pytest.raises(SystemExit) as done:
-            main([str(argument) for argument in arguments])
-        out, err = capsys.readouterr()
-        return int(done.value.code or 0), out, err
-
-    return call
 
 
 @pytest.fixture

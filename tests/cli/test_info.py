@@ -11,20 +11,8 @@ from fleetmap.camera import Camera
 from fleetmap.drive import GnssFix
 from fleetmap.drives.ros2_writer import DriveWriter
 from fleetmap.geometry import Pose
-from fleetmap_cli.main import main
 
 T0_NS = 1_650_000_000_123_456_789
-
-
-@pytest.fixture
-def run(capsys):
-    def call(*arguments: object) -> tuple[int, str, str]:
-        with pytest.raises(SystemExit) as done:
-            main([str(argument) for argument in arguments])
-        out, err = capsys.readouterr()
-        return int(done.value.code or 0), out, err
-
-    return call
 
 
 @pytest.fixture
@@ -39,8 +27,8 @@ def recording(tmp_path):
     return tmp_path / "drive.mcap"
 
 
-def test_a_report_names_topics_frames_calibration_gnss_antenna_and_length(run, recording):
-    code, out, err = run("info", recording)
+def test_a_report_names_topics_frames_calibration_gnss_antenna_and_length(fleetmap, recording):
+    code, out, err = fleetmap("info", recording)
     assert (code, err) == (0, "")
     for text in (
         "1.0 s from 2022-04-15T05:20:00Z",
@@ -56,8 +44,8 @@ def test_a_report_names_topics_frames_calibration_gnss_antenna_and_length(run, r
         assert text in out
 
 
-def test_json_holds_the_same_for_programs(run, recording):
-    code, out, _ = run("info", recording, "--json")
+def test_json_holds_the_same_for_programs(fleetmap, recording):
+    code, out, _ = fleetmap("info", recording, "--json")
     document = json.loads(out)
     assert code == 0
     assert document["images"]["count"] == 11
@@ -67,30 +55,30 @@ def test_json_holds_the_same_for_programs(run, recording):
     assert document["missing"] == []
 
 
-def test_a_recording_with_parts_missing_is_reported(run, tmp_path):
+def test_a_recording_with_parts_missing_is_reported(fleetmap, tmp_path):
     with DriveWriter(tmp_path / "bare.mcap", None) as writer:
         writer.write_image(T0_NS, np.full((48, 64), 100, np.uint8))
-    code, out, _ = run("info", tmp_path / "bare.mcap")
+    code, out, _ = fleetmap("info", tmp_path / "bare.mcap")
     assert code == 0
     assert "missing    GNSS: no NavSatFix" in out
     assert "calibration: " in out
 
 
-def test_a_truncated_recording_is_one_line_and_exit_code_2(run, recording):
+def test_a_truncated_recording_is_one_line_and_exit_code_2(fleetmap, recording):
     recording.write_bytes(recording.read_bytes()[:-100])
-    code, out, err = run("info", recording)
+    code, out, err = fleetmap("info", recording)
     assert (code, out) == (2, "")
     assert err.startswith("error: recording ")
     assert err.count("\n") == 1
 
 
-def test_a_recording_that_is_not_there_is_exit_code_2(run, tmp_path):
-    code, out, err = run("info", tmp_path / "nothing.mcap")
+def test_a_recording_that_is_not_there_is_exit_code_2(fleetmap, tmp_path):
+    code, out, err = fleetmap("info", tmp_path / "nothing.mcap")
     assert (code, out) == (2, "")
     assert "there is no recording" in err
 
 
-def test_help_teaches_by_example(run):
-    code, out, _ = run("info", "--help")
+def test_help_teaches_by_example(fleetmap):
+    code, out, _ = fleetmap("info", "--help")
     assert code == 0
     assert "Example: fleetmap info survey.mcap" in out

@@ -19,20 +19,8 @@ from fleetmap.geodesy import UtmGrid
 from fleetmap.map_package import open_package
 from fleetmap.trajectory import read_trajectory
 from fleetmap.transport import MapClient
-from fleetmap_cli.main import main
 
 Run = Callable[..., tuple[int, str, str]]
-
-
-@pytest.fixture
-def fleetmap(capsys: pytest.CaptureFixture[str]) -> Run:
-    def call(*arguments: object) -> tuple[int, str, str]:
-        with pytest.raises(SystemExit) as done:
-            main([str(argument) for argument in arguments])
-        out, err = capsys.readouterr()
-        return int(done.value.code or 0), out, err
-
-    return call
 
 
 def record(path: Path, drive, frames: slice, with_gnss: bool) -> Path:
