@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 
-from fleetmap.errors import DriveError
+from fleetmap.errors import InputError
 from fleetmap.geometry import Pose
 from fleetmap_mapper.georeferencing import HUBER_SIGMAS, GnssTrack, georeference, path_at_fixes
 from fleetmap_mapper.growing_map import GrowingMap
@@ -45,7 +45,7 @@ class GnssAligner:
         path = path_at_fixes(stamps_ns, [p.vis_from_cam for p in ordered], track)
         try:
             S = georeference(path, track, self._settings.gnss.level_sigma_deg)
-        except DriveError:
+        except InputError:
             return  # not yet determined; later keyframes will see more
         keyframe_stamps = np.array([k.stamp_ns for k in growing.keyframes])
         fixes = np.array([p.fix for p in path])

@@ -116,10 +116,15 @@ def observation_sigmas(placed: PlacedMap) -> Array:
 def carry_fixes(
     placed: PlacedMap, posed: Sequence[PosedFrame], frames: Sequence[Pose], track: GnssTrack
 ) -> list[FixTerm]:
-    """Each fix between two posed images, tied to the keyframe nearest in time by the visual motion in between."""
+    """Each fix between two posed images, tied to a keyframe by the visual motion in between.
+
+    It is the keyframe that the image before hangs on: the nearest in time may belong to another segment.
+    """
     terms = []
-    for point in path_at_fixes(np.array([p.stamp_ns for p in posed], dtype=np.int64), frames, track):
-        keyframe = int(np.argmin(np.abs(placed.keyframe_stamps_ns - track.stamps_ns[point.fix])))
+    stamps_ns = np.array([p.stamp_ns for p in posed], dtype=np.int64)
+    for point in path_at_fixes(stamps_ns, frames, track):
+        before = int(np.searchsorted(stamps_ns, track.stamps_ns[point.fix], side="right")) - 1
+        keyframe = posed[before].keyframe.index
         cam_from_antenna_time = placed.poses[keyframe].inverse() @ point.pose
         terms.append(
             FixTerm(

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.drive import Drive, Frame
-from fleetmap.errors import DriveError
+from fleetmap.errors import InputError
 from fleetmap.geometry import Pose, Sim3
 from fleetmap.manifest import Quality
 from fleetmap.trajectory import Trajectory
@@ -75,7 +75,7 @@ def _placed_segments(
         path = path_at_fixes(_stamps(segment.posed), [p.vis_from_cam for p in segment.posed], track)
         try:
             placeable.append((segment, georeference(path, track, settings.gnss.level_sigma_deg)))
-        except DriveError as error:
+        except InputError as error:
             refusals.append(error)
     if not placeable:
         raise refusals[0]

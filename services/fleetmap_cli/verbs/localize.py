@@ -21,6 +21,7 @@ from fleetmap_localizer.part_cache import PartCache
 from fleetmap_localizer.run import localize_drive
 
 _PATH = click.Path(path_type=Path)
+_FILE = click.Path(path_type=Path, dir_okay=False)
 
 
 @click.command()
@@ -30,7 +31,7 @@ _PATH = click.Path(path_type=Path)
     "--map", "map_", metavar="ID|FOLDER", help="With --server: the map's id. Without: the folder of a map package."
 )
 @click.option(
-    "--trajectory", type=_PATH, required=True, metavar="OUT.tum", help="Write the poses here (TUM text, UTM)."
+    "--trajectory", type=_FILE, required=True, metavar="OUT.tum", help="Write the poses here (TUM text, UTM)."
 )
 @click.option(
     "--near", type=LAT_LON, help="With --server: choose among the maps within 1 km of here, nearest first."
