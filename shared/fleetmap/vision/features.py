@@ -41,7 +41,6 @@ class Features:
 
     pixels: Array  # (N, 2) float64 undistorted pixels (Camera.undistort); may lie outside the image
     octaves: NDArray[np.uint8]  # (N,) uint8 pyramid level
-    angles_deg: NDArray[np.float32]  # (N,) float32 orientation of the patch
     descriptors: NDArray[np.uint8]  # (N, 32) uint8
     scale_factor: float  # between pyramid levels
 
@@ -81,7 +80,6 @@ class FeatureExtractor:
         return Features(
             pixels=pixels[valid],
             octaves=np.array([keypoint.octave for keypoint in described], dtype=np.uint8)[valid],
-            angles_deg=np.array([keypoint.angle for keypoint in described], dtype=np.float32)[valid],
             descriptors=np.ascontiguousarray(descriptors[valid], dtype=np.uint8),
             scale_factor=self.settings.scale_factor,
         )
@@ -176,7 +174,6 @@ def _no_features(scale_factor: float) -> Features:
     return Features(
         pixels=np.zeros((0, 2)),
         octaves=np.zeros(0, dtype=np.uint8),
-        angles_deg=np.zeros(0, dtype=np.float32),
         descriptors=np.zeros((0, DESCRIPTOR_BYTES), dtype=np.uint8),
         scale_factor=scale_factor,
     )

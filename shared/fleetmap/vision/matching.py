@@ -19,7 +19,6 @@ Descriptors = NDArray[np.uint8]
 _NO_PAIR = 1 << 20  # a Hamming distance that no pair has
 _CELL_PX = 16.0
 _EPIPOLE_RADIUS_PX = 10.0  # around the epipole every line passes close by, and the depth is unseen
-_ROTATION_BINS, _ROTATION_BIN_DEG = 30, 12.0
 
 
 def match_descriptors(
@@ -96,7 +95,6 @@ def match_epipolar(
     epipole_in_b_px: Array,
     max_distance: int,
     sigma_threshold: float = 1.96,
-    rotation_check: bool = False,
 ) -> IntArray:
     """Index pairs (P, 2) int32 of features that look alike and lie on each other's epipolar line, sorted by a.
 
@@ -107,7 +105,6 @@ def match_epipolar(
         epipole_in_b_px: (2,) image of camera a's centre in b; features near it are left out. NaN = anywhere.
         max_distance: Hamming bits; a pair is each other's closest among the candidates.
         sigma_threshold: distance to the line, in sigmas of the feature in b.
-        rotation_check: keep only pairs whose patches turn alike (a camera that rolls turns all of them).
     """
     if len(features_a) == 0 or len(features_b) == 0:
         return np.zeros((0, 2), dtype=np.int32)
@@ -124,33 +121,12 @@ def match_epipolar(
         max_distance,
         sigma_threshold,
     )
-    if rotation_check:
-        turns_alike = consistent_rotation(features_a.angles_deg[pairs[:, 0]], features_b.angles_deg[pairs[:, 1]])
-        return np.asarray(pairs[turns_alike])
     return pairs
-
-
-def consistent_rotation(angles_a_deg: NDArray[np.float32], angles_b_deg: NDArray[np.float32]) -> BoolArray:
-    """Which pairs (P,) turn by the angle that most pairs turn by, give or take 18 degrees."""
-    if len(angles_a_deg) == 0:
-        return np.zeros(0, dtype=bool)
-    turns_deg = np.mod(angles_b_deg.astype(np.float64) - angles_a_deg, 360.0)
-    bins = (turns_deg / _ROTATION_BIN_DEG).astype(np.int64) % _ROTATION_BINS
-    peak_deg = (np.argmax(np.bincount(bins, minlength=_ROTATION_BINS)) + 0.5) * _ROTATION_BIN_DEG
-    off_peak_deg = np.abs(np.mod(turns_deg - peak_deg + 180.0, 360.0) - 180.0)
-    return np.asarray(off_peak_deg <= 1.5 * _ROTATION_BIN_DEG)
 
 
 def medoid_descriptor(descriptors: Descriptors) -> int:
     """Index of the descriptor (K, 32) with the least median Hamming distance to the others."""
     return int(_medoid(as_words(descriptors)))
-
-
-def hamming_distances(descriptors_a: Descriptors, descriptors_b: Descriptors) -> IntArray:
-    """Bits (N,) int32 in which the rows of two (N, 32) arrays differ."""
-    return np.asarray(
-        np.bitwise_count(as_words(descriptors_a) ^ as_words(descriptors_b)).sum(axis=1), dtype=np.int32
-    )
 
 
 def as_words(descriptors: Descriptors) -> NDArray[np.uint64]:

@@ -7,8 +7,7 @@ import numpy as np
 from fleetmap.vision.features import Features
 from fleetmap.vision.matching import (
     as_words,
-    consistent_rotation,
-    hamming_distances,
+    hamming,
     match_by_projection,
     match_descriptors,
     match_epipolar,
@@ -36,7 +35,6 @@ def features_at(pixels: np.ndarray, descriptors: np.ndarray, octaves: np.ndarray
     return Features(
         pixels=np.asarray(pixels, dtype=np.float64),
         octaves=np.zeros(len(pixels), np.uint8) if octaves is None else octaves.astype(np.uint8),
-        angles_deg=np.zeros(len(pixels), np.float32),
         descriptors=descriptors,
         scale_factor=1.2,
     )
@@ -44,9 +42,9 @@ def features_at(pixels: np.ndarray, descriptors: np.ndarray, octaves: np.ndarray
 
 def test_hamming_distance_counts_the_bits_that_differ() -> None:
     descriptors = random_descriptors(50)
-    assert np.all(hamming_distances(descriptors, descriptors) == 0)
-    assert np.all(hamming_distances(descriptors, flip_bits(descriptors, 37)) == 37)
-    assert np.all(hamming_distances(descriptors, ~descriptors) == 256)
+    for others, differing in ((descriptors, 0), (flip_bits(descriptors, 37), 37), (~descriptors, 256)):
+        words, other_words = as_words(descriptors), as_words(others)
+        assert all(hamming(words, i, other_words, i) == differing for i in range(50))
 
 
 def test_shuffled_and_disturbed_descriptors_find_their_partners() -> None:
@@ -200,18 +198,6 @@ def test_epipolar_matching_respects_the_line_the_epipole_and_the_flags() -> None
     use_a, use_b = np.arange(400) % 2 == 0, np.arange(400) % 3 == 0
     pairs = match_epipolar(a, b, use_a, use_b, fundamental, anywhere, 0)
     assert np.array_equal(pairs[:, 0], np.flatnonzero(use_a & use_b))
-
-
-def test_pairs_that_turn_against_the_rest_are_told_apart() -> None:
-    rng = np.random.default_rng(0)
-    angles_a = rng.uniform(0, 360, 200).astype(np.float32)
-    turns = np.full(200, 358.0)
-    turns += rng.uniform(-5, 5, 200)
-    turns[:50] = rng.uniform(60, 300, 50)
-    angles_b = np.mod(angles_a + turns, 360.0).astype(np.float32)
-    kept = consistent_rotation(angles_a, angles_b)
-    assert np.all(kept[50:])
-    assert not np.any(kept[:50])
 
 
 def test_the_medoid_is_the_descriptor_in_the_middle() -> None:
