@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -22,6 +23,8 @@ from fleetmap_mapper.quality import assess
 from fleetmap_mapper.segments import join_segments
 from fleetmap_mapper.settings import MapperSettings
 from fleetmap_mapper.slam import PosedFrame, Segment, run_slam
+
+_log = logging.getLogger(__name__)
 
 Progress = Callable[[str, int, int], None]  # stage, done, total
 
@@ -76,9 +79,11 @@ def _placed_segments(
         try:
             placeable.append((segment, georeference(path, track, settings.gnss.level_sigma_deg)))
         except InputError as error:
-            refusals.append(error)
+            refusals.append((segment, error))
     if not placeable:
-        raise refusals[0]
+        raise refusals[0][1]
+    for segment, refusal in refusals:
+        _log.warning("a stretch of %d images is left out of the map: %s", len(segment.posed), refusal)
     return join_segments([s for s, _ in placeable], [S for _, S in placeable]), placeable[0][1]
 
 

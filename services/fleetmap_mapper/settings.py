@@ -69,7 +69,7 @@ class QualityGroup(_Group):
 
     min_posed_ratio: float = 0.95
     max_reprojection_rms_px: float = 2.0
-    max_gnss_residual_sigmas: float = 4.0  # RMS of the residuals over their own sigma
+    max_gnss_residual_sigmas: float = 4.0  # median residual of the fixes over their own sigma
     max_unposed_gap_s: float = 5.0
 
 
