@@ -126,7 +126,6 @@ def growing_with_path(make_world):
         features = Features(
             world.pixels[rows],
             np.zeros(len(rows), np.uint8),
-            np.zeros(len(rows), np.float32),
             np.zeros((len(rows), 32), np.uint8),
             1.2,
         )

@@ -25,7 +25,6 @@ def segment(first_frame: int, points: int, seed: int) -> Segment:
         features = Features(
             rng.uniform(0.0, 400.0, (points, 2)),
             np.zeros(points, np.uint8),
-            np.zeros(points, np.float32),
             rng.integers(0, 256, (points, 32), dtype=np.uint8),
             1.2,
         )
