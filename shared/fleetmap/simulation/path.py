@@ -37,6 +37,13 @@ class StreetPath:
         """Direction of travel, counter-clockwise from grid east."""
         return np.asarray(np.interp(s_m, self.s_m, self.headings_rad))
 
+    def up(self, s_m: Array | float) -> Array:
+        """Unit normals (..., 3) of the road, which lies level across."""
+        s, heading = np.asarray(s_m, dtype=np.float64), self.heading_rad(s_m)
+        slope = (self.at(s + _STEP_M)[..., 2] - self.at(s - _STEP_M)[..., 2]) / (2.0 * _STEP_M)
+        normal = np.stack([-slope * np.cos(heading), -slope * np.sin(heading), np.ones_like(heading)], axis=-1)
+        return np.asarray(normal / np.linalg.norm(normal, axis=-1, keepdims=True))
+
     def knots(self, start_m: float, end_m: float, fine_m: float = 3.0, coarse_m: float = 12.0) -> Array:
         """Where to cut the street into flat pieces: finely where it bends or climbs, coarsely elsewhere."""
         knots = [start_m]
