@@ -1,7 +1,7 @@
-"""A pinhole camera with plumb-bob distortion, in plain numpy.
+"""A calibrated camera: pinhole with one of ROS' distortion models, in plain numpy.
 
 Pixels: (0, 0) is the centre of the top-left pixel. Camera frame: x right, y down, z forward.
-Distortion: Brown-Conrady (k1, k2, p1, p2, k3), as in ROS ``plumb_bob`` and OpenCV.
+Distortion: see fleetmap.distortion.
 """
 
 from __future__ import annotations
@@ -11,15 +11,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap.distortion import COEFFICIENT_COUNTS, DistortionModel, distort, is_distorting, undistort
 from fleetmap.errors import CalibrationError
 
 Array = NDArray[np.float64]
-_UNDISTORT_ITERATIONS = 20
 
 
 @dataclass(frozen=True)
 class Camera:
-    """Intrinsics of one camera."""
+    """Intrinsics of one camera. No coefficients means all zero."""
 
     width_px: int
     height_px: int
@@ -27,14 +27,31 @@ class Camera:
     fy_px: float
     cx_px: float
     cy_px: float
-    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)  # k1, k2, p1, p2, k3
+    distortion: tuple[float, ...] = ()
+    distortion_model: DistortionModel = "plumb_bob"
 
     def __post_init__(self) -> None:
-        numbers = (self.fx_px, self.fy_px, self.cx_px, self.cy_px, *self.distortion)
+        count = COEFFICIENT_COUNTS.get(self.distortion_model)
+        if count is None:
+            raise CalibrationError(
+                f"distortion model '{self.distortion_model}' is not one of {', '.join(COEFFICIENT_COUNTS)}"
+            )
+        coefficients = tuple(float(value) for value in self.distortion) or (0.0,) * count
+        object.__setattr__(self, "distortion", coefficients)
+        if len(coefficients) != count:
+            raise CalibrationError(
+                f"{self.distortion_model} has {count} coefficients, the calibration gives {len(coefficients)}"
+            )
+        numbers = (self.fx_px, self.fy_px, self.cx_px, self.cy_px, *coefficients)
         if not np.all(np.isfinite(numbers)) or self.fx_px <= 0.0 or self.fy_px <= 0.0:
             raise CalibrationError(f"camera calibration is not usable: fx={self.fx_px}, fy={self.fy_px}")
         if self.width_px <= 0 or self.height_px <= 0:
             raise CalibrationError(f"camera size {self.width_px}x{self.height_px} is not usable")
+
+    @property
+    def has_distortion(self) -> bool:
+        """Whether the lens moves any pixel away from where an ideal camera with the same K sees it."""
+        return is_distorting(self.distortion_model, self.distortion)
 
     @property
     def matrix(self) -> Array:
@@ -59,16 +76,12 @@ class Camera:
     def undistort(self, pixels: Array) -> Array:
         """Distorted pixels (N, 2) as pixels (N, 2) of the undistorted camera with the same K.
 
-        Fixed-point iteration, as in Heikkila & Silven (CVPR 1997), section 4.
+        NaN where the lens images nothing that lies in front of the camera.
         """
-        if not any(self.distortion):
+        if not self.has_distortion:
             return np.asarray(pixels, dtype=np.float64)
         centre, focal = np.array([self.cx_px, self.cy_px]), np.array([self.fx_px, self.fy_px])
-        distorted = (pixels - centre) / focal
-        ideal = distorted.copy()
-        for _ in range(_UNDISTORT_ITERATIONS):
-            radial, tangential = self._distortion_terms(ideal)
-            ideal = (distorted - tangential) / radial[:, None]
+        ideal = undistort(self.distortion_model, self.distortion, (pixels - centre) / focal)
         return np.asarray(ideal * focal + centre)
 
     def is_inside(self, pixels: Array, border_px: float = 0.0) -> NDArray[np.bool_]:
@@ -82,20 +95,9 @@ class Camera:
         return np.asarray(normalised * focal + centre)
 
     def _distort(self, normalised: Array) -> Array:
-        if not any(self.distortion):
+        if not self.has_distortion:
             return normalised
-        radial, tangential = self._distortion_terms(normalised)
-        return np.asarray(normalised * radial[:, None] + tangential)
-
-    def _distortion_terms(self, normalised: Array) -> tuple[Array, Array]:
-        k1, k2, p1, p2, k3 = self.distortion
-        x, y = normalised[:, 0], normalised[:, 1]
-        r2 = x * x + y * y
-        radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        tangential = np.stack(
-            [2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x), p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y], axis=1
-        )
-        return radial, tangential
+        return distort(self.distortion_model, self.distortion, normalised)
 
 
 def _normalised(points_in_cam: Array) -> Array:

@@ -34,6 +34,23 @@ class GnssFix:
 
 
 @dataclass(frozen=True)
+class ImuSample:
+    """What an inertial measurement unit reports at one instant, in its own frame."""
+
+    stamp_ns: int  # UTC since the epoch
+    angular_velocity_rad_s: Array  # (3,) float64
+    linear_acceleration_m_s2: Array  # (3,) float64 specific force: at rest it points up with 9.8 m/s^2
+
+
+@dataclass(frozen=True)
+class WheelSpeed:
+    """The vehicle's forward speed as its wheels or its odometry report it."""
+
+    stamp_ns: int  # UTC since the epoch
+    speed_mps: float  # negative in reverse
+
+
+@dataclass(frozen=True)
 class Antenna:
     """Where the GNSS antenna sits, and how we know."""
 
@@ -64,3 +81,9 @@ class Drive(Protocol):
 
     def antenna(self) -> Antenna:
         """Where the antenna sits in the camera's frame."""
+
+    def imu_samples(self) -> Iterator[ImuSample]:
+        """Inertial measurements in time order; nothing when the recording has none."""
+
+    def wheel_speeds(self) -> Iterator[WheelSpeed]:
+        """Forward speeds in time order; nothing when the recording has none."""

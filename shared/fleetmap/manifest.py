@@ -24,7 +24,8 @@ from pydantic import (
 )
 
 from fleetmap.camera import Camera
-from fleetmap.errors import MapPackageError
+from fleetmap.distortion import DistortionModel
+from fleetmap.errors import CalibrationError, MapPackageError
 from fleetmap.geodesy import UtmAnchor
 from fleetmap.geometry import Sim3, rotations_from_quat_xyzw
 
@@ -114,7 +115,16 @@ class CameraRecord(_Model):
     fy_px: float = Field(gt=0.0)
     cx_px: float
     cy_px: float
-    distortion: tuple[float, float, float, float, float]
+    distortion: tuple[float, ...] = Field(max_length=16)
+    distortion_model: DistortionModel = "plumb_bob"
+
+    @model_validator(mode="after")
+    def _is_a_camera(self) -> CameraRecord:
+        try:
+            self.to_camera()
+        except CalibrationError as error:
+            raise ValueError(str(error)) from error
+        return self
 
     def to_camera(self) -> Camera:
         """The camera of the record."""

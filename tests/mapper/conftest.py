@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from fleetmap.camera import Camera
-from fleetmap.drive import Antenna, Frame, GnssFix
+from fleetmap.drive import Antenna, Frame, GnssFix, ImuSample, WheelSpeed
 from fleetmap.drives import open_drive
 from fleetmap.geometry import Pose, so3_exp
 from fleetmap_mapper.mapper import MappedDrive, map_drive
@@ -131,6 +131,12 @@ class DriveInMemory:
 
     def antenna(self) -> Antenna:
         return Antenna(np.array(self.antenna_in_cam_m), "static transform")
+
+    def imu_samples(self) -> Iterator[ImuSample]:
+        return iter(())
+
+    def wheel_speeds(self) -> Iterator[WheelSpeed]:
+        return iter(())
 
     def blacked_out(self, first: int, last: int) -> DriveInMemory:
         """The same with images ``first`` to ``last`` black."""

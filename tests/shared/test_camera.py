@@ -80,3 +80,67 @@ def test_the_image_ends_at_the_centres_of_its_outer_pixels():
 def test_a_camera_that_cannot_be_is_refused(numbers):
     with pytest.raises(CalibrationError, match="not usable"):
         Camera(*numbers)
+
+
+RATIONAL = Camera(
+    1280, 720, 640.5, 641.5, 639.5, 359.5, (0.6, 0.25, 1e-3, -5e-4, 0.02, 0.8, 0.3, 0.05), "rational_polynomial"
+)
+FISHEYE = Camera(752, 480, 320.97, 320.95, 367.2, 248.4, (-0.0036, 0.0008, -0.0203, 0.0129), "equidistant")
+WIDE = Camera(1000, 1000, 300.0, 300.0, 499.5, 499.5, distortion_model="equidistant")  # 190 deg corner to corner
+
+
+@pytest.mark.parametrize("camera", [RATIONAL, FISHEYE], ids=["rational_polynomial", "equidistant"])
+def test_unproject_and_project_are_inverses_for_every_model(camera):
+    x, y = np.meshgrid(np.linspace(0, camera.width_px - 1, 40), np.linspace(0, camera.height_px - 1, 30))
+    pixels = np.column_stack([x.ravel(), y.ravel()])
+    rays = camera.unproject(pixels)
+    imaged = np.isfinite(rays).all(axis=1)
+    assert imaged.mean() > 0.9
+    assert np.abs(camera.project(3.0 * rays[imaged]) - pixels[imaged]).max() < 1e-6
+    assert np.allclose(camera.project_ideal(rays[imaged]), camera.undistort(pixels[imaged]), atol=1e-6)
+
+
+def test_the_rational_model_agrees_with_opencv():
+    rng = np.random.default_rng(1)
+    points = np.stack([rng.uniform(-4, 4, 200), rng.uniform(-2, 2, 200), rng.uniform(4, 20, 200)], axis=1)
+    zero = np.zeros(3)
+    expected, _ = cv2.projectPoints(points, zero, zero, RATIONAL.matrix, np.array(RATIONAL.distortion))
+    assert np.abs(RATIONAL.project(points) - expected.reshape(-1, 2)).max() < 1e-9
+
+
+def test_the_equidistant_model_agrees_with_opencv():
+    rng = np.random.default_rng(2)
+    points = np.stack([rng.uniform(-4, 4, 200), rng.uniform(-2, 2, 200), rng.uniform(1, 20, 200)], axis=1)
+    zero = np.zeros(3)
+    expected, _ = cv2.fisheye.projectPoints(
+        points[:, None], zero, zero, FISHEYE.matrix, np.array(FISHEYE.distortion)
+    )
+    assert np.abs(FISHEYE.project(points) - expected.reshape(-1, 2)).max() < 1e-9
+
+
+def test_an_equidistant_lens_bends_the_image_also_without_coefficients():
+    assert WIDE.has_distortion
+    (pixel,) = WIDE.project(np.array([[1.0, 0.0, 1.0]]))  # 45 degrees off axis
+    assert pixel == pytest.approx([499.5 + 300.0 * np.pi / 4.0, 499.5])
+
+
+def test_what_lies_beside_and_behind_an_equidistant_lens_has_no_ray_in_front():
+    assert np.isnan(WIDE.unproject(np.array([[0.0, 0.0]]))[0, :2]).all()
+    assert np.isfinite(WIDE.unproject(np.array([[499.5, 80.0], [100.0, 499.5]]))).all()
+
+
+@pytest.mark.parametrize("k1", [-0.37, -0.2])
+def test_points_beyond_where_the_polynomial_turns_back_have_no_pixel(k1):
+    camera = Camera(640, 480, 500.0, 500.0, 319.5, 239.5, (k1, 0.0, 0.0, 0.0, 0.0))
+    turning = 1.0 / np.sqrt(-3.0 * k1)
+    inside, outside = camera.project(np.array([[0.99 * turning, 0.0, 1.0], [1.01 * turning, 0.0, 1.0]]))
+    assert np.isfinite(inside).all()
+    assert np.isnan(outside).all()
+
+
+@pytest.mark.parametrize(
+    ("distortion", "model"), [((0.1,) * 4, "plumb_bob"), ((0.1,) * 5, "rational_polynomial"), ((), "omni")]
+)
+def test_a_model_that_is_unknown_or_short_of_coefficients_is_refused(distortion, model):
+    with pytest.raises(CalibrationError, match=model):
+        Camera(640, 480, 500.0, 500.0, 319.5, 239.5, distortion, model)

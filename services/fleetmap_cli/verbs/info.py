@@ -41,7 +41,9 @@ def _report(found: DriveInfo) -> Iterator[str]:
     if found.images is not None:
         yield f"images     {_images_line(found.images)}"
     if (camera := found.camera) is not None:
-        distortion = " ".join(f"{value:g}" for value in camera.distortion) if any(camera.distortion) else "none"
+        distortion = "none"
+        if camera.has_distortion:
+            distortion = f"{camera.distortion_model} {' '.join(f'{value:g}' for value in camera.distortion)}"
         yield (
             f"camera     {camera.width_px}x{camera.height_px}, fx {camera.fx_px:g} fy {camera.fy_px:g}"
             f" cx {camera.cx_px:g} cy {camera.cy_px:g}, distortion {distortion}"

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from fleetmap.camera import Camera
-from fleetmap.drive import Antenna, Frame, GnssFix
+from fleetmap.drive import Antenna, Frame, GnssFix, ImuSample, WheelSpeed
 from fleetmap.drives import image_codec
 from fleetmap.drives.mcap_file import McapFile
 from fleetmap.drives.ros2_messages import (
@@ -140,6 +140,14 @@ class Ros2Drive:
             DriveError: several GNSS topics and none was chosen.
         """
         return self._antenna
+
+    def imu_samples(self) -> Iterator[ImuSample]:
+        """Inertial measurements in time order; nothing when the recording has none."""
+        return iter(())
+
+    def wheel_speeds(self) -> Iterator[WheelSpeed]:
+        """Forward speeds in time order; nothing when the recording has none."""
+        return iter(())
 
     @cached_property
     def _fixes(self) -> list[GnssFix]:

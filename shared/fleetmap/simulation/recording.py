@@ -10,7 +10,7 @@ import numpy as np
 from tqdm import tqdm
 
 from fleetmap.camera import Camera
-from fleetmap.drive import Antenna, Frame, GnssFix
+from fleetmap.drive import Antenna, Frame, GnssFix, ImuSample, WheelSpeed
 from fleetmap.drives.ros2_writer import DriveWriter
 from fleetmap.errors import InputError
 from fleetmap.geometry import Pose
@@ -63,6 +63,14 @@ class SimulatedDrive:
         """Where the antenna sits in the camera's frame."""
         offset = np.array(self.antenna_in_cam_m, dtype=np.float64)
         return Antenna(offset, "static transform" if offset.any() else "same frame")
+
+    def imu_samples(self) -> Iterator[ImuSample]:
+        """None are simulated."""
+        return iter(())
+
+    def wheel_speeds(self) -> Iterator[WheelSpeed]:
+        """None are simulated."""
+        return iter(())
 
 
 def simulate_drive(

@@ -1,181 +1,250 @@
-"""Which surface each pixel sees: a z-buffer on planes.
+"""Which surface each pixel sees: a z-buffer on planes, tile by tile.
 
-Everything is projective geometry: for a viewing ray d = (x, y, 1) in the camera's frame, a surface gives texture
-coordinates (s, t, 1) ~ texture_from_ray @ d, and its inverse depth is a linear function of d. So texture, depth
-and outline of a surface agree to rounding.
+Everything is linear: along a viewing ray d from the camera's centre, a surface has an inverse distance w = i . d and
+texture coordinates (S, T, W) = (s . d, t . d, w' . d) up to scale, and d hits it where 0 <= S, T <= W and w > 0. So
+texture, depth and outline of a surface agree to rounding, nothing needs to be cut at a near plane, and any lens
+works: it is only a table of rays. (Edge functions on homogeneous coordinates: M. Olano, T. Greer, "Triangle Scan
+Conversion using 2D Homogeneous Coordinates", Graphics Hardware 1997.)
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import lru_cache
+from typing import Any
 
-import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
-from scipy.ndimage import find_objects
 
-from fleetmap.camera import Camera
-from fleetmap.geometry import Pose
-from fleetmap.simulation.atlas import MAX_LEVEL, Atlas
-from fleetmap.simulation.surfaces import GreyImage, Surfaces
+from fleetmap.simulation.rays import TILE_PIXELS
+from fleetmap.simulation.surfaces import Surfaces
 
 Array = NDArray[np.float64]
-FloatImage = NDArray[np.float32]
-Ids = NDArray[np.int32]
-Boxes = list[tuple[slice, slice] | None]  # rows, columns of each surface
+Plane = Any  # what numba infers
 
-NOTHING = -1  # the id of the sky
-_NEAR_M = 0.2
-_NEARLY_ZERO = np.float32(1e-12)
-_EMPTY = (slice(0, 0), slice(0, 0))
+NOTHING = -1  # the index of the sky
+S, T, W, INVERSE = 0, 1, 2, 3  # rows of a plane: texture coordinates, their denominator, inverse distance
+_SMALLEST_RADIUS_PX = 0.35  # surfaces that look smaller than this are left out
+_MIP_BIAS = np.float32(1.0)
 
 
-@dataclass(frozen=True)
-class View:
-    """The surfaces as one camera sees them, with viewing rays d = (x, y, 1)."""
+def surfaces_in_cone(
+    surfaces: Surfaces, centre_m: Array, axis: Array, widest_rad: float, smallest_rad: float, slack_m: float = 0.0
+) -> NDArray[np.int64]:
+    """Indices (M,) of surfaces that may be seen within an angle of an axis, nearest centre first.
 
-    texture_from_ray: Array  # (Q, 3, 3): rows give s, t and their common denominator
-    inverse_depth: Array  # (Q, 3): 1 / z = row @ d
-    outlines_in_cam: Array  # (Q, 8, 3): corners, and where edges cross the near plane
-    on_outline: NDArray[np.bool_]  # (Q, 8): which of them bound the part before the near plane
-    front_to_back: NDArray[np.int64]  # (M,) the surfaces that may be in view
-
-
-def view_of(surfaces: Surfaces, map_from_cam: Pose) -> View:
-    """Carry surfaces into a camera's frame; those behind it or turned away are left out of ``front_to_back``."""
-    weights = surfaces.weights
-    texture = surfaces.map_from_texture - map_from_cam.translation_m[:, None] * weights[:, 2:3]
-    ray_from_texture = map_from_cam.rotation.T @ texture
-    determinant = np.linalg.det(ray_from_texture)
-    faces = (determinant > 1e-9) | (surfaces.two_sided & (determinant < -1e-9))
-    texture_from_ray = np.zeros_like(ray_from_texture)
-    texture_from_ray[faces] = np.linalg.inv(ray_from_texture[faces])
-    inverse_depth = (weights[:, 2:3] @ texture_from_ray)[:, 0]
-    corners = (surfaces.corners_in_map - map_from_cam.translation_m) @ map_from_cam.rotation
-    outlines, on_outline = _cut_at_near_plane(corners)
-    candidates = np.flatnonzero(faces & on_outline.any(axis=1))
-    distance = np.linalg.norm(corners[candidates].mean(axis=1), axis=1)
-    front_to_back = candidates[np.argsort(distance, kind="stable")]
-    return View(texture_from_ray, inverse_depth, outlines, on_outline, front_to_back)
-
-
-def _cut_at_near_plane(corners: Array) -> tuple[Array, NDArray[np.bool_]]:
-    following = np.roll(corners, -1, axis=1)
-    depth, next_depth = corners[..., 2], following[..., 2]
-    crossing = (depth - _NEAR_M) * (next_depth - _NEAR_M) < 0.0
-    fraction = np.where(crossing, (_NEAR_M - depth) / np.where(crossing, next_depth - depth, 1.0), 0.0)
-    cuts = corners + fraction[..., None] * (following - corners)
-    return np.concatenate([corners, cuts], axis=1), np.concatenate([depth >= _NEAR_M, crossing], axis=1)
-
-
-@dataclass(frozen=True)
-class Grid:
-    """Where the pixels of an image look, and the even grid of ray coordinates on which visibility is decided.
-
-    Without distortion both are the same; with it, each pixel asks its nearest neighbour on the even grid.
+    Left out: what is further from the axis than ``widest_rad``, and what looks smaller than ``smallest_rad``.
+    ``slack_m`` lets the camera move.
     """
-
-    x: FloatImage  # (W',) even
-    y: FloatImage  # (H',)
-    px_per_unit: tuple[float, float]  # fx, fy
-    pixel_x: FloatImage  # (H, W)
-    pixel_y: FloatImage  # (H, W)
-    nearest: (
-        tuple[NDArray[np.int64], NDArray[np.int64]] | None
-    )  # row and column of each pixel's neighbour; None: the same grid
-
-    def at_pixels(self, ids: Ids) -> Ids:
-        """Values (H', W') of the even grid at the pixels (H, W)."""
-        return ids if self.nearest is None else ids[self.nearest]
+    distance = _distances_in_cone(
+        surfaces.corners_in_map, centre_m, axis, float(widest_rad), float(smallest_rad), float(slack_m)
+    )
+    found = np.flatnonzero(np.isfinite(distance))
+    return found[np.argsort(distance[found], kind="stable")]
 
 
-@lru_cache(maxsize=16)
-def sampling_grid(camera: Camera, shift_px: tuple[float, float]) -> Grid:
-    """The grid of a camera whose pixels look ``shift_px`` (x, y) beside their centres."""
-    columns = np.arange(camera.width_px) + shift_px[0]
-    rows = np.arange(camera.height_px) + shift_px[1]
-    pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
-    rays = camera.unproject(pixels)[:, :2].reshape(camera.height_px, camera.width_px, 2)
-    focal = np.array([camera.fx_px, camera.fy_px])
-    low, high = rays.min(axis=(0, 1)), rays.max(axis=(0, 1))
-    x, y = (low[i] + np.arange(round((high[i] - low[i]) * focal[i]) + 2) / focal[i] for i in range(2))
-    nearest = None
-    if any(camera.distortion):
-        column, row = np.rint((rays - low) * focal).astype(np.int64).transpose(2, 0, 1)
-        nearest = (row, column)
-    else:
-        x, y = x[:-1], y[:-1]
-    pixel_x, pixel_y = (np.ascontiguousarray(rays[..., i], dtype=np.float32) for i in range(2))
-    focal_px = (camera.fx_px, camera.fy_px)
-    return Grid(x.astype(np.float32), y.astype(np.float32), focal_px, pixel_x, pixel_y, nearest)
+def smallest_angle_rad(px_per_rad: float) -> float:
+    """The angle below which a surface is smaller than a pixel."""
+    return _SMALLEST_RADIUS_PX / px_per_rad
 
 
-def boxes_in_view(view: View, grid: Grid) -> Boxes:
-    """Rows and columns of the even grid that hold the outline of each surface; None when out of view."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        rays = view.outlines_in_cam[..., :2] / view.outlines_in_cam[..., 2:]
-    low = np.where(view.on_outline[..., None], rays, np.inf).min(axis=1)
-    high = np.where(view.on_outline[..., None], rays, -np.inf).max(axis=1)
-    origin, size = np.array([grid.x[0], grid.y[0]], dtype=np.float64), np.array([len(grid.x), len(grid.y)])
-    first = np.clip(np.floor((low - origin) * grid.px_per_unit), 0, size).astype(np.int64)
-    last = np.clip(np.ceil((high - origin) * grid.px_per_unit) + 1, 0, size).astype(np.int64)
-    return [
-        (slice(top, bottom), slice(left, right)) if top < bottom and left < right else None
-        for (left, top), (right, bottom) in zip(first.tolist(), last.tolist(), strict=True)
-    ]
+@njit(cache=True, nogil=True, error_model="numpy")
+def _distances_in_cone(corners: Array, centre: Array, axis: Array, widest: float, smallest: float, slack: float) -> Any:
+    """Distance (Q,) to the middle of each surface; infinite where its bounding sphere is out of the cone."""
+    distances = np.full(len(corners), np.inf)
+    for q in range(len(corners)):
+        x = 0.25 * (corners[q, 0, 0] + corners[q, 1, 0] + corners[q, 2, 0] + corners[q, 3, 0])
+        y = 0.25 * (corners[q, 0, 1] + corners[q, 1, 1] + corners[q, 2, 1] + corners[q, 3, 1])
+        z = 0.25 * (corners[q, 0, 2] + corners[q, 1, 2] + corners[q, 2, 2] + corners[q, 3, 2])
+        square = 0.0
+        for i in range(4):
+            dx, dy, dz = corners[q, i, 0] - x, corners[q, i, 1] - y, corners[q, i, 2] - z
+            square = max(square, dx * dx + dy * dy + dz * dz)
+        radius = np.sqrt(square) + slack
+        x, y, z = x - centre[0], y - centre[1], z - centre[2]
+        distance = np.sqrt(x * x + y * y + z * z)
+        if distance > radius:
+            if radius < smallest * distance:
+                continue
+            cosine = (x * axis[0] + y * axis[1] + z * axis[2]) / distance
+            if np.arccos(min(max(cosine, -1.0), 1.0)) > widest + np.arcsin(radius / distance):
+                continue
+        distances[q] = distance
+    return distances
 
 
-def boxes_seen(ids: Ids, count: int) -> Boxes:
-    """Rows and columns where each surface was seen, two pixels wider; None for those that were not seen.
+@njit(cache=True, nogil=True, error_model="numpy")
+def planes_in_cam(corners: Array, two_sided: Any, map_from_cam: Array, centre: Array, planes: Any) -> None:
+    """Fill ``planes`` (M, 4, 3) float32: rows S, T, W and inverse distance of surfaces (M, 4, 3) seen from ``centre``.
 
-    Enough for renderings shifted by less than a pixel; it misses what is thinner than a pixel everywhere.
+    A point of the surface is P + u e1 + v e2 with its first corner P and two of its edges; P. Heckbert,
+    "Fundamentals of Texture Mapping and Image Warping", 1989, section 2.2.3, gives texture from u, v. Surfaces
+    that are turned away or seen from their edge get zeros, which nothing hits.
     """
-    found = find_objects(ids + 1)
-    seen: Boxes = [None] * count
-    for surface, box in enumerate(found):
-        if box is not None:
-            rows, columns = (slice(max(side.start - 2, 0), side.stop + 2) for side in box)
-            seen[surface] = rows, columns
-    return seen
-
-
-def visible_surfaces(surfaces: Surfaces, atlas: Atlas, view: View, boxes: Boxes, grid: Grid) -> Ids:
-    """Id (H', W') of the surface seen at each place of the even grid; NOTHING for the sky."""
-    nearest = np.zeros((len(grid.y), len(grid.x)), dtype=np.float32)  # inverse depth
-    ids = np.full(nearest.shape, NOTHING, dtype=np.int32)
-    s, t, scale = view.texture_from_ray.transpose(1, 0, 2)
-    # All that must be positive where a surface is hit: the distances from its four edges, and 1 / z.
-    planes = np.stack([s, t, scale - s, scale - t, view.inverse_depth], axis=1).astype(np.float32)
-    largest = 1.001 / np.where(view.on_outline, view.outlines_in_cam[..., 2], np.inf).min(axis=1)
-    for surface in view.front_to_back.tolist():
-        rows, columns = boxes[surface] or _EMPTY
-        buffer = nearest[rows, columns]
-        if not buffer.size or largest[surface] < buffer.min():
+    for m in range(len(corners)):
+        planes[m] = 0.0
+        first = corners[m, 0] - centre
+        right, below = corners[m, 1] - corners[m, 0], corners[m, 3] - corners[m, 0]
+        normal = np.cross(below, right)
+        area2 = (normal * normal).sum()
+        height = (normal * first).sum()
+        if not (height < -1e-9 * np.sqrt(area2) or (two_sided[m] and height > 1e-9 * np.sqrt(area2))):
             continue
-        values = _affine(planes[surface], grid.x[columns], grid.y[rows])
-        mask = (values[:4].min(axis=0) >= 0.0) & (values[4] > buffer)
-        pyramid = atlas.opacities[surfaces.texture_indices[surface]]
-        if pyramid is not None:
-            scale_here = values[0] + values[2]
-            scale_here[scale_here == 0.0] = _NEARLY_ZERO  # on the surface's own horizon, where it is never seen
-            mask &= _is_opaque(pyramid, values[0] / scale_here, values[1] / scale_here)
-        seen = mask.view(np.uint8)  # cv2.copyTo writes into the views in place, faster than numpy's masked copy
-        cv2.copyTo(values[4], seen, buffer)
-        cv2.copyTo(np.full(seen.shape, surface, dtype=np.int32), seen, ids[rows, columns])
-    return ids
+        along_u, along_v = np.cross(right, normal) * 0.0, np.cross(normal, right) / area2
+        along_u = np.cross(below, normal) / area2
+        along_u *= 1.0 / (along_u * right).sum()
+        along_v *= 1.0 / (along_v * below).sum()
+        diagonal = corners[m, 2] - corners[m, 0]
+        a, b = (along_u * diagonal).sum(), (along_v * diagonal).sum()
+        s_of_u, t_of_v = (a + b - 1.0) / a, (a + b - 1.0) / b
+        inverse = normal / height
+        row_s, row_t = along_u * s_of_u, along_v * t_of_v
+        row_w = -(1.0 - s_of_u) * along_u - (1.0 - t_of_v) * along_v
+        row_s = row_s - (row_s * first).sum() * inverse
+        row_t = row_t - (row_t * first).sum() * inverse
+        row_w = row_w + (1.0 - (row_w * first).sum()) * inverse
+        for axis in range(3):
+            column = map_from_cam[:, axis]
+            planes[m, S, axis] = (row_s * column).sum()
+            planes[m, T, axis] = (row_t * column).sum()
+            planes[m, W, axis] = (row_w * column).sum()
+            planes[m, INVERSE, axis] = (inverse * column).sum()
 
 
-def _affine(rows: FloatImage, x: FloatImage, y: FloatImage) -> FloatImage:
-    """rows (K, 3) @ (x, y, 1) on the grid of x (W,) and y (H,): (K, H, W)."""
-    across, down = rows[:, :1] * x, rows[:, 1:2] * y + rows[:, 2:]
-    return np.asarray(across[:, None, :] + down[:, :, None])
+@njit(cache=True, nogil=True, error_model="numpy")
+def bin_surfaces(planes: Any, low: Any, high: Any, lists: Any, counts: Any) -> None:
+    """Sort planes (M, 4, 3) into the tiles of a band: ``lists`` (T, M) and their lengths ``counts`` (T,)."""
+    counts[:] = 0
+    band_low, band_high = low[0].copy(), high[0].copy()
+    for tile in range(1, len(low)):
+        band_low, band_high = np.minimum(band_low, low[tile]), np.maximum(band_high, high[tile])
+    for m in range(len(planes)):
+        if _may_hit(planes[m], band_low, band_high):
+            for tile in range(len(low)):
+                if _may_hit(planes[m], low[tile], high[tile]):
+                    lists[tile, counts[tile]] = m
+                    counts[tile] += 1
 
 
-def _is_opaque(pyramid: tuple[GreyImage, ...], s: FloatImage, t: FloatImage) -> NDArray[np.bool_]:
-    """Where a see-through texture is solid, read from the level that fits the box."""
-    texels_per_px = pyramid[0].shape[0] * np.median(np.abs(np.diff(t, axis=0))) if len(t) > 1 else np.inf
-    level = pyramid[int(np.clip(np.log2(max(float(texels_per_px), 1.0)), 0, MAX_LEVEL))]
-    column = s * np.float32(level.shape[1]) - np.float32(0.5)
-    row = t * np.float32(level.shape[0]) - np.float32(0.5)
-    return np.asarray(cv2.remap(level, column, row, cv2.INTER_LINEAR) > 127)
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _highest(a: Any, b: Any, c: Any, low: Any, high: Any) -> Any:
+    """The largest value of (a, b, c) . d in a box of rays."""
+    return (
+        max(a * low[0], a * high[0]) + max(b * low[1], b * high[1]) + max(c * low[2], c * high[2])
+    )
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _may_hit(plane: Any, low: Any, high: Any) -> bool:
+    """False only when no ray of a box (components between ``low`` and ``high``) hits the surface."""
+    if not _highest(plane[INVERSE, 0], plane[INVERSE, 1], plane[INVERSE, 2], low, high) > 0.0:
+        return False
+    for row in range(2):
+        a, b, c = plane[row, 0], plane[row, 1], plane[row, 2]
+        if not _highest(a, b, c, low, high) >= 0.0:
+            return False
+        if not _highest(plane[W, 0] - a, plane[W, 1] - b, plane[W, 2] - c, low, high) >= 0.0:
+            return False
+    return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def see_tile(
+    planes: Any, texture_of: Any, members: Any, rays: Any, shifts: Any, low: Any, high: Any, opacity: Any,
+    nearest: Any, seen: Any, values: Any,
+) -> None:
+    """What each sample of a tile sees.
+
+    Args:
+        planes: (M, 4, 3) of all surfaces.
+        texture_of: (M,) their textures.
+        members: (N,) those that may be in this tile, nearest first.
+        rays: (3, TILE_PIXELS) of the pixel centres.
+        shifts: (K, 3) what a sample's place beside the centre adds to the ray.
+        low: (3,) smallest components of the rays.
+        high: (3,) largest components.
+        opacity: see Opacity in fleetmap.simulation.atlas.
+        nearest: (K, TILE_PIXELS) float32, filled with inverse distances.
+        seen: (K, TILE_PIXELS) int32, filled with indices of planes, or NOTHING.
+        values: (4, TILE_PIXELS) float32, room to work.
+    """
+    nearest[:] = np.float32(0.0)
+    seen[:] = np.int32(NOTHING)
+    farthest = np.float32(0.0)
+    for member in members:
+        plane = planes[member]
+        if _highest(plane[INVERSE, 0], plane[INVERSE, 1], plane[INVERSE, 2], low, high) <= farthest:
+            continue
+        for row in range(4):
+            a, b, c = plane[row, 0], plane[row, 1], plane[row, 2]
+            for p in range(TILE_PIXELS):
+                values[row, p] = a * rays[0, p] + b * rays[1, p] + c * rays[2, p]
+        transparent = opacity.level_starts[texture_of[member], 0] >= 0
+        for k in range(len(shifts)):
+            shift = shifts[k]
+            ds = plane[S, 0] * shift[0] + plane[S, 1] * shift[1] + plane[S, 2] * shift[2]
+            dt = plane[T, 0] * shift[0] + plane[T, 1] * shift[1] + plane[T, 2] * shift[2]
+            dw = plane[W, 0] * shift[0] + plane[W, 1] * shift[1] + plane[W, 2] * shift[2]
+            di = plane[INVERSE, 0] * shift[0] + plane[INVERSE, 1] * shift[1] + plane[INVERSE, 2] * shift[2]
+            if transparent:
+                _cover_opaque_part(member, values, ds, dt, dw, di, texture_of[member], opacity, nearest[k], seen[k])
+            else:
+                _cover(member, values, ds, dt, dw, di, nearest[k], seen[k])
+        farthest = nearest.min()
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _cover(member: Any, values: Any, ds: Any, dt: Any, dw: Any, di: Any, nearest: Any, seen: Any) -> None:
+    """Put a surface into the z-buffer; written without branches, so that it compiles to vector instructions."""
+    for p in range(TILE_PIXELS):
+        s, t = values[S, p] + ds, values[T, p] + dt
+        w, inverse = values[W, p] + dw, values[INVERSE, p] + di
+        hit = (s >= 0.0) & (t >= 0.0) & (w >= s) & (w >= t) & (inverse > nearest[p])
+        nearest[p] = inverse if hit else nearest[p]
+        seen[p] = member if hit else seen[p]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _cover_opaque_part(
+    member: Any, values: Any, ds: Any, dt: Any, dw: Any, di: Any, texture: Any, opacity: Any, nearest: Any, seen: Any
+) -> None:
+    """The same for a see-through surface: only where its texture is solid."""
+    level = -1
+    for p in range(TILE_PIXELS):
+        s, t = values[S, p] + ds, values[T, p] + dt
+        w, inverse = values[W, p] + dw, values[INVERSE, p] + di
+        if s >= 0.0 and t >= 0.0 and w >= s and w >= t and inverse > nearest[p] and w > 0.0:
+            if level < 0:
+                q = p + 1 if (p + 1) % 32 else p - 1
+                other_t = (values[T, q] + dt) / (values[W, q] + dw)
+                other_s = (values[S, q] + ds) / (values[W, q] + dw)
+                level = opacity_level(opacity, texture, abs(other_s - s / w), abs(other_t - t / w))
+            if is_opaque(opacity, texture, level, s / w, t / w):
+                nearest[p] = inverse
+                seen[p] = member
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def opacity_level(opacity: Any, texture: Any, step_s: Any, step_t: Any) -> int:
+    """The level of a see-through texture that fits steps of texture coordinates from pixel to pixel."""
+    texels = max(step_s * opacity.level_sizes[texture, 0, 0], step_t * opacity.level_sizes[texture, 0, 1])
+    level = 0
+    while texels >= 2.0 and level < opacity.level_starts.shape[1] - 1:
+        texels *= 0.5
+        level += 1
+    return level
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def is_opaque(opacity: Any, texture: Any, level: Any, s: Any, t: Any) -> bool:
+    """Whether a see-through texture is solid at texture coordinates in [0, 1]."""
+    width, height = opacity.level_sizes[texture, level, 0], opacity.level_sizes[texture, level, 1]
+    x = min(max(s * width - np.float32(0.5), np.float32(0.0)), np.float32(width - 1))
+    y = min(max(t * height - np.float32(0.5), np.float32(0.0)), np.float32(height - 1))
+    column, row = int(x), int(y)
+    right, below = min(column + 1, width - 1), min(row + 1, height - 1)
+    start = opacity.level_starts[texture, level]
+    fx, fy = x - np.float32(column), y - np.float32(row)
+    texels = opacity.texels
+    top = texels[start + row * width + column] * (np.float32(1.0) - fx) + texels[start + row * width + right] * fx
+    bottom = texels[start + below * width + column] * (np.float32(1.0) - fx) + texels[start + below * width + right] * fx
+    return top * (np.float32(1.0) - fy) + bottom * fy > np.float32(127.0)
