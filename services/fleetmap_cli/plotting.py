@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from fleetmap.errors import InputError
-from fleetmap.evaluation import TrajectoryErrors
+from fleetmap.evaluation import Judgement
 from fleetmap.files import atomic_path
 
 Array = NDArray[np.float64]
@@ -30,8 +30,13 @@ class Track:
     style: str = "-"  # matplotlib's line format, such as "k--" or "."
 
 
-def plot_evaluation(path: Path, tracks: Sequence[Track], errors: Mapping[str, TrajectoryErrors]) -> None:
-    """Trajectories from above on the left, position errors along the way on the right.
+def plot_evaluation(
+    path: Path,
+    tracks: Sequence[Track],
+    judged: Mapping[str, Judgement],
+    landmarks_m: Array | None = None,
+) -> None:
+    """Trajectories and landmarks (N, 3) from above; beside them, along the road, the errors and the windows.
 
     Raises:
         InputError: the file name's ending is no picture format.
@@ -39,9 +44,17 @@ def plot_evaluation(path: Path, tracks: Sequence[Track], errors: Mapping[str, Tr
     """
     require_picture_name(path)
     figure = new_figure(width_in=13.0, height_in=6.0)
-    from_above, along = figure.subplots(1, 2)
-    draw_from_above(from_above, tracks)
-    draw_errors(along, errors)
+    rows = (
+        ["errors", "residuals", "scales"] if any(entry.windows.count for entry in judged.values()) else ["errors"]
+    )
+    panels = figure.subplot_mosaic([["above", row] for row in rows], height_ratios=[2.0, 1.0, 1.0][: len(rows)])
+    draw_from_above(panels["above"], tracks, landmarks_m)
+    draw_errors(panels["errors"], judged)
+    if "scales" in panels:
+        draw_windows(panels["residuals"], panels["scales"], judged)
+        for name in ("residuals", "scales"):
+            panels[name].sharex(panels["errors"])
+    panels[rows[-1]].set_xlabel("way driven along the reference (m)")
     save_figure(figure, path)
 
 
@@ -52,31 +65,48 @@ def new_figure(width_in: float, height_in: float) -> Figure:
     return figure
 
 
-def draw_from_above(axes: Any, tracks: Sequence[Track]) -> None:
+def draw_from_above(axes: Any, tracks: Sequence[Track], landmarks_m: Array | None = None) -> None:
     """Easting to the right, northing up, one scale for both; axes count from a round corner of the grid."""
     corner_m = _round_corner([track.positions_m for track in tracks])
+    if landmarks_m is not None:  # not counted for the extent: single ones lie far away
+        easting_m, northing_m = (landmarks_m[:, :2] - corner_m).T
+        look = {"color": "0.6", "markersize": 1.5, "markeredgewidth": 0, "zorder": 0}
+        axes.plot(easting_m, northing_m, ".", label="landmarks", scalex=False, scaley=False, **look)
     for track in tracks:
         easting_m, northing_m = (track.positions_m[:, :2] - corner_m).T
         axes.plot(easting_m, northing_m, track.style, label=track.name, linewidth=1.2, markersize=3)
     axes.set_xlabel(f"easting - {corner_m[0]:.0f} (m)")
     axes.set_ylabel(f"northing - {corner_m[1]:.0f} (m)")
     axes.set_aspect("equal", adjustable="datalim")
+    axes.margins(0.1)
     axes.grid(alpha=0.3)
     axes.legend()
 
 
-def draw_errors(axes: Any, errors: Mapping[str, TrajectoryErrors]) -> None:
-    """Position error over time since the earliest compared pose, one line for each entry."""
-    start_ns = min(int(entry.stamps_ns[0]) for entry in errors.values())
-    for name, entry in errors.items():
-        axes.plot(
-            (entry.stamps_ns - start_ns) / 1e9, entry.distances_m, ".-", label=name, linewidth=0.8, markersize=3
-        )
-    axes.set_xlabel("time since the first compared pose (s)")
+def draw_errors(axes: Any, judged: Mapping[str, Judgement]) -> None:
+    """Position error along the road, one line for each entry."""
+    for name, entry in judged.items():
+        label = f"{name}: mean {entry.errors.position_m.mean:.3f} m"
+        axes.plot(entry.errors.driven_m, entry.errors.distances_m, ".-", label=label, linewidth=0.8, markersize=3)
     axes.set_ylabel("position error (m)")
     axes.set_ylim(bottom=0.0)
     axes.grid(alpha=0.3)
-    axes.legend()
+    axes.legend(fontsize="small")
+
+
+def draw_windows(residuals: Any, scales: Any, judged: Mapping[str, Judgement]) -> None:
+    """RMSE and scale of each window at its middle, in the colours of draw_errors."""
+    window_m = next(iter(judged.values())).windows.window_m
+    for entry in judged.values():
+        windows = entry.windows
+        residuals.plot(windows.centres_m, windows.rmse_m, linewidth=1.0)
+        scales.plot(windows.centres_m, windows.scales, linewidth=1.0)
+    residuals.set_ylabel("RMSE (m)")
+    residuals.set_title(f"windows of {window_m:g} m, each aligned by a Sim(3) of its own", fontsize="small")
+    residuals.set_ylim(bottom=0.0)
+    scales.set_ylabel("scale")
+    for axes in (residuals, scales):
+        axes.grid(alpha=0.3)
 
 
 def require_picture_name(path: Path) -> None:

@@ -108,13 +108,21 @@ def test_the_spline_through_the_recorded_fixes_stands_beside(
             writer.write_fix(GnssFix(stamp_ns, lat, lon, height, np.eye(3) * 0.0025), "camera")
     judged = ["estimate.tum", "reference.tum", "--spline-through", "drive.mcap"]
     assert run(*judged, "--json") == 0
-    spline = json.loads(capsys.readouterr().out)["spline"]
-    assert spline["position_m"]["mean"] == pytest.approx(0.75, abs=1e-4)
-    assert (spline["matched"], spline["comparable"]) == (41, 50)
-    assert "rotation_deg" not in spline
+    figures = json.loads(capsys.readouterr().out)
+    for name in ("spline", "smoothing_spline"):
+        spline = figures[name]
+        assert spline["position_m"]["mean"] == pytest.approx(0.75, abs=1e-4)
+        assert (spline["matched"], spline["comparable"]) == (41, 50)
+        assert "rotation_deg" not in spline
+    assert figures["reference"]["yardstick"] == {
+        "common": 41, "mean_m": pytest.approx(1.3, abs=1e-4), "yardstick_mean_m": pytest.approx(0.75, abs=1e-4),
+        "difference_m": pytest.approx(0.55, abs=1e-4), "interval": None, "better": False,
+    }  # fmt: skip
     assert run(*judged, "--plot", "out.png") == 0
     out = capsys.readouterr().out
-    assert out.splitlines()[1].split() == ["3-D", "horizontal", "spline", "3-D", "spline", "horizontal"]
+    heading = "3-D horizontal spline 3-D spline horizontal smooth 3-D smooth horizontal"
+    assert out.splitlines()[1].split() == heading.split()
+    assert "NOT better than GNSS alone" in out
     assert "spline coverage: 41 of 50" in out
     assert (files / "out.png").is_file()
 

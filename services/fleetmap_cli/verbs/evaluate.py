@@ -7,33 +7,33 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import click
 import numpy as np
+from click.core import ParameterSource
 
-from fleetmap.evaluation import (
-    Alignment,
-    ErrorStatistics,
-    TrajectoryErrors,
-    evaluate_against_map,
-    evaluate_trajectory,
-)
+from fleetmap.covariances import PoseCovariances, read_covariances
+from fleetmap.errors import InputError
+from fleetmap.evaluation import Alignment, Judgement, evaluate_against_map, evaluate_trajectory, judge
 from fleetmap.trajectory import Trajectory, read_trajectory
+from fleetmap_cli.evaluation_report import TITLES, report
 from fleetmap_cli.options import XYZ
 
-ROWS = ("max", "mean", "median", "min", "rmse", "sse", "std", "p95")
-
 _FILE = click.Path(path_type=Path)
+_OF_REFERENCE = ("align", "spline_through", "compare")  # options that do nothing without REFERENCE.tum
+_OF_RECORDING = ("antenna_offset", "image_topic", "gnss_topic")  # ... without --spline-through
 
 
 @dataclass(frozen=True)
 class _Inputs:
-    """The trajectories that the command line names."""
+    """What the command line names."""
 
     estimate: Trajectory
     reference: Trajectory | None
     survey: Trajectory | None
+    compare: Trajectory | None
+    covariances: PoseCovariances | None
 
 
 @click.command()
@@ -58,14 +58,44 @@ class _Inputs:
     show_default=True,
     help="Move the estimate onto the reference before comparing: se3 without, sim3 with a scale.",
 )
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of tables.")
-@click.option("--plot", type=_FILE, metavar="OUT.png", help="Draw the trajectories and the error along the way.")
+@click.option(
+    "--window-m",
+    type=click.FloatRange(min=0.0, min_open=True),
+    default=50.0,
+    show_default=True,
+    help="Length of the windows to each of which a Sim(3) of its own is fitted.",
+)
+@click.option(
+    "--covariances",
+    type=_FILE,
+    metavar="FILE.csv",
+    help="Also judge the covariances of the estimate's poses, as written by 'fleetmap localize --covariances'.",
+)
 @click.option(
     "--spline-through",
     type=_FILE,
     metavar="RECORDING.mcap",
-    help="Print beside the reference errors what a cubic spline through this recording's GNSS fixes alone would "
-    "give: the yardstick a map has to beat.",
+    help="Print beside the reference errors what this recording's GNSS fixes alone would give: the yardsticks "
+    "that a map has to beat.",
+)
+@click.option(
+    "--antenna-offset",
+    type=XYZ,
+    help="With --spline-through: antenna from the camera centre in metres: forward, left, up; used where the "
+    "recording does not say.",
+)
+@click.option("--image-topic", metavar="TOPIC", help="With --spline-through: which camera, of several.")
+@click.option("--gnss-topic", metavar="TOPIC", help="With --spline-through: which receiver, of several.")
+@click.option(
+    "--compare",
+    type=_FILE,
+    metavar="OTHER.tum",
+    help="Judge, and draw, another trajectory of the same drive likewise, such as the map made without GNSS.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of tables.")
+@click.option("--plot", type=_FILE, metavar="OUT.png", help="Draw the trajectories and the errors along the road.")
+@click.option(
+    "--landmarks", type=_FILE, metavar="MAP_FOLDER", help="With --plot: draw the landmarks of this map from above."
 )
 def evaluate(
     estimate: Path,
@@ -73,9 +103,14 @@ def evaluate(
     against_map: Path | None,
     camera_offset: tuple[float, float, float] | None,
     align: str,
+    window_m: float,
+    covariances: Path | None,
+    spline_through: Path | None,
+    compare: Path | None,
     as_json: bool,
     plot: Path | None,
-    spline_through: Path | None,
+    landmarks: Path | None,
+    **recording_options: Any,
 ) -> None:
     """Judge ESTIMATE.tum against REFERENCE.tum, or --against-map, or both.
 
@@ -83,72 +118,129 @@ def evaluate(
     standard deviation of the absolute position error in 3-D and horizontally, the rotation error, and how many
     poses could be compared.
 
+    Windows judge the shape without luck: to every 50 m of the road, starting at the first pose of every metre, a
+    Sim(3) of its own is fitted; mean and maximum of their RMSE tell the local error, the ratio of the largest to
+    the smallest scale tells the drift. A window must fit whole: a drive shorter than one has none.
+
+    Intervals (95 %) are bootstrapped over segments of the road of 50 m or more, as neighbouring errors are
+    alike; a drive of less than two segments has none. Errors alike over longer ways, such as the slow bias of a
+    consumer receiver, they do not see.
+
+    Yardsticks (--spline-through): a cubic spline through the fixes, the antenna taken as the camera; and a
+    smoothing spline that weighs the fixes by their covariance, with the lever arm taken off. A map that does not
+    beat them owes nothing to its images.
+
+    NEES (--covariances): of consistent poses its mean is 6 (3 for the position alone); above, the covariances
+    promise too much. Against a map the constant rotation between the cameras is taken off first.
+
     \b
     Examples:
-      fleetmap evaluate survey.tum survey.reference.tum
-      fleetmap evaluate second.tum --against-map survey.tum --camera-offset 0.54,0,0 --plot second.png
+      fleetmap evaluate survey.tum survey.reference.tum --spline-through survey.mcap
+      fleetmap evaluate survey.tum survey.reference.tum --compare no_gnss.tum --plot survey.png --landmarks my_map
+      fleetmap evaluate second.tum --against-map survey.tum --camera-offset 0.54,0,0 --covariances second.csv
 
-    With --json: {"reference": {...}, "against_map": {...}, "spline": {...}}, only those asked for, each with
-    position_m, horizontal_m, rotation_deg, rotation_spread_deg (each max, mean, median, min, rmse, sse, std,
-    p95), rotation_offset_deg, matched, comparable, coverage, over_2m and scale.
+    With --json: {"reference": {...}, "compare": {...}, "spline": {...}, "smoothing_spline": {...}, "against_map":
+    {...}}, only those asked for. Each holds
+
+    \b
+      position_m, horizontal_m, rotation_deg, rotation_spread_deg
+                  each {max, mean, median, min, rmse, sse, std, p95}; splines have no rotation
+      rotation_offset_deg, matched, comparable, coverage, over_2m, scale
+      windows     {window_m, count, left_out, mean_rmse_m, max_rmse_m, scale_min, scale_max, scale_ratio,
+                  log_scale_std}, or null where none could be fitted
+      intervals   {confidence, segments, segment_m, position_m, horizontal_m, rotation_deg, rotation_spread_deg:
+                  {mean, median, rmse, p95}, windows: {mean_rmse_m}, nees: {pose_mean, position_mean}, coverage};
+                  each figure [low, high], or null where there is only one segment
+      nees        {count, pose, position: {dof, mean, inside_95, band_95}}, with --covariances
+      yardstick   {common, mean_m, yardstick_mean_m, difference_m, interval, better}, with --spline-through and
+                  no alignment: against the smoothing spline, over the poses that both have
     """
-    _require_sensible_options(reference, against_map, camera_offset, align, spline_through)
+    _require_sensible_options(click.get_current_context())
     if plot is not None:
         _require_drawable(plot)
     inputs = _Inputs(
         estimate=read_trajectory(estimate),
         reference=read_trajectory(reference) if reference else None,
         survey=read_trajectory(against_map) if against_map else None,
+        compare=read_trajectory(compare) if compare else None,
+        covariances=read_covariances(covariances) if covariances else None,
     )
-    errors = _judge(inputs, cast(Alignment, align), camera_offset or (0.0, 0.0, 0.0), spline_through)
+    judged = _judge(inputs, cast(Alignment, align), window_m, camera_offset or (0.0, 0.0, 0.0))
+    if spline_through is not None and inputs.reference is not None:
+        judged |= _judge_splines(spline_through, inputs.reference, window_m, recording_options)
     if plot is not None:
-        _draw(plot, inputs, errors)
+        _draw(plot, inputs, judged, landmarks)
     if as_json:
-        figures = {name: entry.to_json() for name, entry in errors.items()}
-        click.echo(json.dumps(figures, allow_nan=False, indent=1))
+        click.echo(json.dumps(_figures(judged), allow_nan=False, indent=1))
     else:
-        click.echo("\n\n".join("\n".join(lines) for lines in _report(errors)))
+        click.echo("\n\n".join("\n".join(lines) for lines in report(judged)))
 
 
 def _judge(
-    inputs: _Inputs, align: Alignment, camera_offset: tuple[float, float, float], spline_through: Path | None
-) -> dict[str, TrajectoryErrors]:
-    """The errors asked for, under the keys that --json documents."""
-    errors: dict[str, TrajectoryErrors] = {}
+    inputs: _Inputs, align: Alignment, window_m: float, camera_offset: tuple[float, float, float]
+) -> dict[str, Judgement]:
+    """The judgements asked for, under the keys that --json documents."""
+    judged: dict[str, Judgement] = {}
     if inputs.reference is not None:
-        errors["reference"] = evaluate_trajectory(inputs.estimate, inputs.reference, align=align)
-        if spline_through is not None:
-            errors["spline"] = _judge_spline(spline_through, inputs.reference)
+        errors = evaluate_trajectory(inputs.estimate, inputs.reference, align=align)
+        judged["reference"] = judge(errors, window_m=window_m, covariances=inputs.covariances)
+        if inputs.compare is not None:
+            others = evaluate_trajectory(inputs.compare, inputs.reference, align=align)
+            judged["compare"] = judge(others, window_m=window_m)
     if inputs.survey is not None:
-        errors["against_map"] = evaluate_against_map(inputs.estimate, inputs.survey, np.array(camera_offset))
-    return errors
+        errors = evaluate_against_map(inputs.estimate, inputs.survey, np.array(camera_offset))
+        judged["against_map"] = judge(errors, window_m=window_m, covariances=inputs.covariances)
+    return judged
 
 
-def _require_sensible_options(
-    reference: Path | None,
-    against_map: Path | None,
-    camera_offset: tuple[float, float, float] | None,
-    align: str,
-    spline_through: Path | None,
-) -> None:
-    """Refuse combinations in which an option would silently do nothing."""
-    if reference is None and against_map is None:
-        raise click.UsageError("nothing to judge against: give REFERENCE.tum, --against-map SURVEY.tum, or both")
-    if camera_offset is not None and against_map is None:
-        raise click.UsageError("--camera-offset belongs to --against-map SURVEY.tum, which is not given")
-    if reference is None and align != "none":
-        raise click.UsageError(f"--align {align} needs REFERENCE.tum to align with")
-    if reference is None and spline_through is not None:
-        raise click.UsageError("--spline-through needs REFERENCE.tum to judge the spline against")
-
-
-def _judge_spline(recording: Path, reference: Trajectory) -> TrajectoryErrors:
+def _judge_splines(
+    recording: Path, reference: Trajectory, window_m: float, options: dict[str, Any]
+) -> dict[str, Judgement]:
     from fleetmap.drives import open_drive
-    from fleetmap.yardstick import evaluate_gnss_spline
+    from fleetmap.yardstick import evaluate_gnss_spline, evaluate_smoothing_spline
 
     with _needing("--spline-through", "recordings"):
-        fixes = open_drive(recording).gnss_fixes()
-    return evaluate_gnss_spline(fixes, reference)
+        drive = open_drive(
+            recording,
+            image_topic=options["image_topic"],
+            gnss_topic=options["gnss_topic"],
+            antenna_offset_m=options["antenna_offset"],
+        )
+        fixes = drive.gnss_fixes()
+    cubic = evaluate_gnss_spline(fixes, reference)
+    smoothing = evaluate_smoothing_spline(fixes, reference, drive.antenna().position_in_cam_m)
+    return {"spline": judge(cubic, window_m=window_m), "smoothing_spline": judge(smoothing, window_m=window_m)}
+
+
+def _figures(judged: dict[str, Judgement]) -> dict[str, Any]:
+    """The JSON form; what is held against the yardstick says how that came out."""
+    from fleetmap.yardstick import compare_with_yardstick
+
+    figures = {name: entry.to_json() for name, entry in judged.items()}
+    for name in ("reference", "compare"):
+        if name in judged and "smoothing_spline" in judged and judged[name].errors.scale is None:
+            comparison = compare_with_yardstick(judged[name].errors, judged["smoothing_spline"].errors)
+            figures[name]["yardstick"] = None if comparison is None else comparison.to_json()
+    return figures
+
+
+def _require_sensible_options(context: click.Context) -> None:
+    """Refuse combinations in which an option would silently do nothing."""
+
+    given = context.params
+
+    def refuse_without(needed: str, described: str, options: tuple[str, ...]) -> None:
+        for option in options:
+            typed = context.get_parameter_source(option) is not ParameterSource.DEFAULT
+            if typed and given[needed] is None and given[option] not in (None, "none"):
+                raise click.UsageError(f"--{option.replace('_', '-')} needs {described}, which is not given")
+
+    if given["reference"] is None and given["against_map"] is None:
+        raise click.UsageError("nothing to judge against: give REFERENCE.tum, --against-map SURVEY.tum, or both")
+    refuse_without("against_map", "--against-map SURVEY.tum", ("camera_offset",))
+    refuse_without("reference", "REFERENCE.tum to judge against", _OF_REFERENCE)
+    refuse_without("spline_through", "--spline-through RECORDING.mcap", _OF_RECORDING)
+    refuse_without("plot", "--plot OUT.png to be drawn in", ("landmarks",))
 
 
 def _require_drawable(plot: Path) -> None:
@@ -157,19 +249,40 @@ def _require_drawable(plot: Path) -> None:
     require_picture_name(plot)
 
 
-def _draw(plot: Path, inputs: _Inputs, errors: dict[str, TrajectoryErrors]) -> None:
+def _draw(plot: Path, inputs: _Inputs, judged: dict[str, Judgement], landmarks: Path | None) -> None:
     from fleetmap_cli.plotting import Track, plot_evaluation
 
-    aligned = "reference" in errors and errors["reference"].scale is not None
-    estimate_m = errors["reference"].positions_m if aligned else inputs.estimate.positions_m
-    tracks = [Track("estimate, aligned" if aligned else "estimate", estimate_m, "C0.-")]
+    tracks = []
+    for name, label, trajectory, style in (
+        ("reference", "estimate", inputs.estimate, "C0.-"),
+        ("compare", "compared", inputs.compare, "C3-"),
+    ):
+        if trajectory is not None:
+            aligned = name in judged and judged[name].errors.scale is not None
+            positions_m = judged[name].errors.positions_m if aligned else trajectory.positions_m
+            tracks.append(Track(f"{label}, aligned" if aligned else label, positions_m, style))
     if inputs.survey is not None:
         tracks.append(Track("trajectory of the map", inputs.survey.positions_m, "C2-"))
-    if "spline" in errors:
-        tracks.append(Track("GNSS spline", errors["spline"].positions_m, "C1-"))
+    for name, label, style in (("spline", "cubic", "C1-"), ("smoothing_spline", "smoothing spline", "C4-")):
+        if name in judged:
+            tracks.append(Track(f"GNSS alone, {label}", judged[name].errors.positions_m, style))
     if inputs.reference is not None:
         tracks.append(Track("reference", inputs.reference.positions_m, "k--"))
-    plot_evaluation(plot, tracks, {_TITLES[name]: entry for name, entry in errors.items()})
+    points_m = None if landmarks is None else _read_landmarks_m(landmarks, inputs.estimate.epsg)
+    plot_evaluation(plot, tracks, {TITLES[name]: entry for name, entry in judged.items()}, points_m)
+
+
+def _read_landmarks_m(folder: Path, epsg: int) -> np.ndarray:
+    """UTM positions (N, 3) of a map's landmarks."""
+    from fleetmap.map_package import open_package
+
+    content = open_package(folder).localization_map()
+    if content.anchor.epsg != epsg:
+        raise InputError(
+            f"{folder} lies in EPSG:{content.anchor.epsg}, the trajectory in EPSG:{epsg}; "
+            "only a map of the same UTM zone can be drawn beside it"
+        )
+    return content.anchor.utm_from_map(content.landmarks.points_m)
 
 
 @contextmanager
@@ -181,58 +294,3 @@ def _needing(option: str, extra: str) -> Iterator[None]:
         raise click.ClickException(
             f"{option} needs the package '{error.name}': pip install 'fleetmap[{extra}]'"
         ) from error
-
-
-_TITLES = {
-    "reference": "against the reference",
-    "spline": "GNSS spline against the reference",
-    "against_map": "relative to the map's trajectory",
-}
-
-
-def _report(errors: dict[str, TrajectoryErrors]) -> Iterator[list[str]]:
-    """The lines of each printed table; the yardstick's columns stand beside the reference's."""
-    for name in ("reference", "against_map"):
-        if name not in errors:
-            continue
-        columns, yardstick = _columns("", errors[name]), []
-        if name == "reference" and "spline" in errors:
-            columns |= _columns("spline ", errors["spline"])
-            yardstick = [
-                "  spline: cubic through the GNSS fixes alone, antenna taken as the camera, never aligned",
-                f"  spline {_coverage(errors['spline'])}",
-            ]
-        heading = f"Position error {_TITLES[name]} (m; sse in m^2)"
-        yield [heading, *_table(columns), *_remarks(errors[name]), *yardstick]
-
-
-def _columns(prefix: str, errors: TrajectoryErrors) -> dict[str, ErrorStatistics]:
-    return {f"{prefix}3-D": errors.position_m, f"{prefix}horizontal": errors.horizontal_m}
-
-
-def _table(columns: dict[str, ErrorStatistics]) -> Iterator[str]:
-    yield f"  {'':8}" + "".join(f"{name:>19}" for name in columns)
-    for row in ROWS:
-        yield f"  {row:8}" + "".join(f"{getattr(column, row):>19.4f}" for column in columns.values())
-
-
-def _remarks(errors: TrajectoryErrors) -> Iterator[str]:
-    yield f"  {_coverage(errors)}"
-    yield f"  more than 2 m off: {errors.over_2m}"
-    if errors.scale is not None:
-        yield f"  aligned first, scale {errors.scale:.6f}"
-    if errors.rotation is not None:
-        yield f"  rotation error (deg): {_triple(errors.rotation.angles_deg)}"
-        yield (
-            f"  of it constant {errors.rotation.offset_deg:.3f}; left about that: "
-            f"{_triple(errors.rotation.spread_deg)}"
-        )
-
-
-def _coverage(errors: TrajectoryErrors) -> str:
-    return f"coverage: {errors.matched} of {errors.comparable} poses compared ({100.0 * errors.coverage:.1f} %)"
-
-
-def _triple(angles_deg: np.ndarray) -> str:
-    statistics = ErrorStatistics.of(angles_deg)
-    return f"median {statistics.median:.3f}, mean {statistics.mean:.3f}, max {statistics.max:.3f}"
