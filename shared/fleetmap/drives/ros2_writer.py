@@ -14,22 +14,31 @@ from numpy.typing import NDArray
 
 from fleetmap import __version__
 from fleetmap.camera import Camera
-from fleetmap.drive import GnssFix
+from fleetmap.drive import GnssFix, ImuSample, WheelSpeed
 from fleetmap.drives.image_codec import encode_image
 from fleetmap.drives.ros2_messages import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
+    IMAGE,
     NAV_SAT_FIX,
     TF_MESSAGE,
     definition_text,
     encode,
     standard_typestore,
 )
+from fleetmap.errors import CalibrationError
 from fleetmap.files import atomic_path, refuse_existing
-from fleetmap.geometry import Pose, quat_xyzw_from_rotations
+from fleetmap.geometry import Array, Pose, quat_xyzw_from_rotations
 
+_IMU, _TWIST_STAMPED, _LASER_SCAN = (
+    "sensor_msgs/msg/Imu",
+    "geometry_msgs/msg/TwistStamped",
+    "sensor_msgs/msg/LaserScan",
+)
 _TF_STATIC_TOPIC = "/tf_static"
 _COVARIANCE_KNOWN, _FIX, _GPS = 3, 0, 1  # constants of sensor_msgs/NavSatFix and NavSatStatus
+_NOT_MEASURED = -1.0  # first element of a sensor_msgs/Imu covariance whose quantity the sensor does not give
+_MILLIMETRES_PER_METRE, _FARTHEST_MM = 1000.0, 65_535
 
 
 class DriveWriter:
@@ -49,8 +58,17 @@ class DriveWriter:
         image_topic: str = "/camera/image/compressed",
         info_topic: str = "/camera/camera_info",
         gnss_topic: str = "/gnss/fix",
+        imu_topic: str = "/imu/data",
+        wheel_topic: str = "/vehicle/speed",
+        depth_topic: str = "/camera/depth/image",
+        depth_info_topic: str = "/camera/depth/camera_info",
+        scan_topic: str = "/scan",
+        compress_chunks: bool = False,
     ) -> None:
         """Nothing is written before the block is entered; ``camera=None`` records without calibration.
+
+        ``compress_chunks`` is for recordings with depth images or scans: they halve and better (zstd), while
+        JPEG and PNG only cost time a second time.
 
         Raises:
             OutputExistsError: the file is there already and ``force`` is not given.
@@ -58,6 +76,9 @@ class DriveWriter:
         refuse_existing(path, force)
         self._path, self._camera, self._camera_frame_id = path, camera, camera_frame_id
         self._image_topic, self._info_topic, self._gnss_topic = image_topic, info_topic, gnss_topic
+        self._imu_topic, self._wheel_topic, self._scan_topic = imu_topic, wheel_topic, scan_topic
+        self._depth_topic, self._depth_info_topic = depth_topic, depth_info_topic
+        self._compression = CompressionType.ZSTD if compress_chunks else CompressionType.NONE
         self._types = standard_typestore().types
         self._transforms: list[tuple[str, str, Pose]] = []
         self._channel_ids: dict[str, int] = {}
@@ -70,8 +91,7 @@ class DriveWriter:
         draft = self._stack.enter_context(atomic_path(self._path))
         try:
             self._file = self._stack.enter_context(draft.open("wb"))
-            # Images arrive compressed: a second compression would cost time and save nothing.
-            self._writer = Writer(self._file, compression=CompressionType.NONE)
+            self._writer = Writer(self._file, compression=self._compression)
             self._writer.start(profile="ros2", library=f"fleetmap {__version__}")
         except OSError as error:
             self._stack.__exit__(type(error), error, error.__traceback__)
@@ -91,7 +111,7 @@ class DriveWriter:
             os.fsync(self._file.fileno())
 
     def write_image(self, stamp_ns: int, image: NDArray[np.uint8], *, png: bool = False) -> None:
-        """Compress a grey image (height, width) as JPEG of quality 95, or losslessly as PNG, and write it."""
+        """Compress an image, grey (height, width) or BGR (height, width, 3), as JPEG of quality 95 or as PNG."""
         self._write_compressed(stamp_ns, encode_image(image, png=png), "png" if png else "jpeg")
 
     def write_jpeg(self, stamp_ns: int, jpeg: bytes) -> None:
@@ -115,6 +135,98 @@ class DriveWriter:
             position_covariance_type=_COVARIANCE_KNOWN,
         )
         self._write(self._gnss_topic, message, fix.stamp_ns)
+
+    def write_imu(
+        self,
+        sample: ImuSample,
+        frame_id: str,
+        *,
+        angular_velocity_covariance: Array | None = None,
+        linear_acceleration_covariance: Array | None = None,
+    ) -> None:
+        """Write a measurement of the IMU whose frame is ``frame_id``.
+
+        Covariances (3, 3) in (rad/s)^2 and (m/s^2)^2; None says that they are not known, as ROS does with zeros.
+        """
+        unknown = np.zeros((3, 3))
+        message = self._types[_IMU](
+            header=self._header(sample.stamp_ns, frame_id),
+            orientation=self._quaternion(np.array([0.0, 0.0, 0.0, 1.0])),
+            orientation_covariance=np.array([_NOT_MEASURED, *(0.0,) * 8]),
+            angular_velocity=self._vector(sample.angular_velocity_rad_s),
+            angular_velocity_covariance=_nine(angular_velocity_covariance, unknown),
+            linear_acceleration=self._vector(sample.linear_acceleration_m_s2),
+            linear_acceleration_covariance=_nine(linear_acceleration_covariance, unknown),
+        )
+        self._write(self._imu_topic, message, sample.stamp_ns)
+
+    def write_wheel_speed(self, speed: WheelSpeed, frame_id: str = "base_link") -> None:
+        """Write a forward speed, the x axis of the vehicle's frame ``frame_id`` (REP 103)."""
+        twist = self._types["geometry_msgs/msg/Twist"](
+            linear=self._vector(np.array([speed.speed_mps, 0.0, 0.0])), angular=self._vector(np.zeros(3))
+        )
+        message = self._types[_TWIST_STAMPED](header=self._header(speed.stamp_ns, frame_id), twist=twist)
+        self._write(self._wheel_topic, message, speed.stamp_ns)
+
+    def write_depth(self, stamp_ns: int, depth_m: NDArray[np.floating[Any]]) -> None:
+        """Write a depth image (height, width) of the camera's own pixels, with a CameraInfo of its own.
+
+        It becomes ``16UC1`` in millimetres (REP 118); 0 where there is no return: NaN, not positive, or beyond
+        65.535 m.
+
+        Raises:
+            CalibrationError: the depth image is not as large as the camera's images.
+        """
+        height_px, width_px = depth_m.shape
+        if self._camera is not None:
+            if (width_px, height_px) != (self._camera.width_px, self._camera.height_px):
+                raise CalibrationError(
+                    f"a depth image of {width_px}x{height_px} pixels does not belong to a camera of"
+                    f" {self._camera.width_px}x{self._camera.height_px}"
+                )
+            self._write(self._depth_info_topic, self._camera_info(self._camera, stamp_ns), stamp_ns)
+        message = self._types[IMAGE](
+            header=self._header(stamp_ns, self._camera_frame_id),
+            height=height_px,
+            width=width_px,
+            encoding="16UC1",
+            is_bigendian=0,
+            step=2 * width_px,
+            data=_millimetres(depth_m).astype("<u2").view(np.uint8).reshape(-1),
+        )
+        self._write(self._depth_topic, message, stamp_ns)
+
+    def write_scan(
+        self,
+        stamp_ns: int,
+        ranges_m: NDArray[np.floating[Any]],
+        *,
+        angle_min_rad: float,
+        angle_increment_rad: float,
+        range_min_m: float,
+        range_max_m: float,
+        frame_id: str = "laser",
+        scan_time_s: float = 0.0,
+    ) -> None:
+        """Write one turn of a 2-D lidar: ranges (N,) from ``angle_min_rad`` on, counter-clockwise about z.
+
+        A beam without return is infinite (REP 117); ``stamp_ns`` is that of the first beam, and the beams are
+        spread evenly over ``scan_time_s``.
+        """
+        count = len(ranges_m)
+        message = self._types[_LASER_SCAN](
+            header=self._header(stamp_ns, frame_id),
+            angle_min=angle_min_rad,
+            angle_max=angle_min_rad + angle_increment_rad * max(count - 1, 0),
+            angle_increment=angle_increment_rad,
+            time_increment=scan_time_s / count if count else 0.0,
+            scan_time=scan_time_s,
+            range_min=range_min_m,
+            range_max=range_max_m,
+            ranges=np.asarray(ranges_m, dtype=np.float32),
+            intensities=np.zeros(0, dtype=np.float32),
+        )
+        self._write(self._scan_topic, message, stamp_ns)
 
     def write_static_transform(self, parent: str, child: str, parent_from_child: Pose) -> None:
         """Say how two frames are mounted; all of them are written as one /tf_static message at the end."""
@@ -166,7 +278,7 @@ class DriveWriter:
             header=self._header(stamp_ns, self._camera_frame_id),
             height=camera.height_px,
             width=camera.width_px,
-            distortion_model="plumb_bob",
+            distortion_model=camera.distortion_model,
             d=np.array(camera.distortion, dtype=np.float64),
             k=camera.matrix.reshape(9),
             r=np.eye(3).reshape(9),
@@ -177,9 +289,26 @@ class DriveWriter:
         )
 
     def _transform(self, pose: Pose) -> Any:
-        x, y, z = (float(value) for value in pose.translation_m)
-        qx, qy, qz, qw = (float(value) for value in quat_xyzw_from_rotations(pose.rotation))
         return self._types["geometry_msgs/msg/Transform"](
-            translation=self._types["geometry_msgs/msg/Vector3"](x=x, y=y, z=z),
-            rotation=self._types["geometry_msgs/msg/Quaternion"](x=qx, y=qy, z=qz, w=qw),
+            translation=self._vector(pose.translation_m),
+            rotation=self._quaternion(quat_xyzw_from_rotations(pose.rotation)),
         )
+
+    def _vector(self, xyz: Array) -> Any:
+        x, y, z = (float(value) for value in xyz)
+        return self._types["geometry_msgs/msg/Vector3"](x=x, y=y, z=z)
+
+    def _quaternion(self, quat_xyzw: Array) -> Any:
+        x, y, z, w = (float(value) for value in quat_xyzw)
+        return self._types["geometry_msgs/msg/Quaternion"](x=x, y=y, z=z, w=w)
+
+
+def _nine(covariance: Array | None, unknown: Array) -> Array:
+    return np.ascontiguousarray(unknown if covariance is None else covariance, dtype=np.float64).reshape(9)
+
+
+def _millimetres(depth_m: NDArray[np.floating[Any]]) -> NDArray[np.uint16]:
+    with np.errstate(invalid="ignore", over="ignore"):
+        millimetres = np.rint(np.asarray(depth_m, dtype=np.float64) * _MILLIMETRES_PER_METRE)
+        is_return = (millimetres > 0.0) & (millimetres <= _FARTHEST_MM)
+    return np.where(is_return, millimetres, 0.0).astype(np.uint16)

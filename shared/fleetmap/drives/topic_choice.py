@@ -18,6 +18,8 @@ from fleetmap.errors import CalibrationError, DriveError
 
 _log = logging.getLogger(__name__)
 
+_DEPTH_ENCODINGS = ("16UC1", "32FC1")  # REP 118: millimetres, metres
+
 
 def first_message(mcap: McapFile, topic: str) -> Any:
     """The first message of a topic that has some."""
@@ -37,7 +39,7 @@ def topics_of_type(mcap: McapFile, *message_types: str) -> list[str]:
 
 
 def choose_image_topic(mcap: McapFile, wanted: str | None) -> str:
-    """The only image topic, or the wanted one.
+    """The only image topic, or the wanted one; depth images do not count beside others.
 
     Raises:
         DriveError: no images, several topics and none wanted, or the wanted one is not there.
@@ -48,6 +50,8 @@ def choose_image_topic(mcap: McapFile, wanted: str | None) -> str:
     if not candidates:
         held = ", ".join(f"{topic.name} ({topic.message_type})" for topic in mcap.topics.values()) or "nothing"
         raise DriveError(f"{mcap.path} holds no ROS 2 images (CompressedImage or Image in CDR); it holds {held}")
+    if len(candidates) > 1:
+        candidates = [topic for topic in candidates if not _holds_depth(mcap, topic)] or candidates
     if len(candidates) > 1:
         raise DriveError(
             f"{mcap.path} holds {len(candidates)} image topics: {', '.join(candidates)};"
@@ -105,6 +109,11 @@ def choose_calibration(mcap: McapFile, image_topic: str, image_frame_id: str) ->
             f" (by frame '{image_frame_id}', or by name {_sibling_info_topics(image_topic)[0]})"
         )
     return chosen, infos[chosen]
+
+
+def _holds_depth(mcap: McapFile, topic: str) -> bool:
+    is_raw = mcap.topics[topic].message_type == IMAGE
+    return is_raw and str(first_message(mcap, topic).encoding) in _DEPTH_ENCODINGS
 
 
 def _sibling_info_topics(image_topic: str) -> list[str]:

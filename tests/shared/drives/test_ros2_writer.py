@@ -13,10 +13,10 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from fleetmap.camera import Camera
-from fleetmap.drive import GnssFix
+from fleetmap.drive import GnssFix, ImuSample, WheelSpeed
 from fleetmap.drives import open_drive
 from fleetmap.drives.ros2_writer import DriveWriter
-from fleetmap.errors import OutputExistsError
+from fleetmap.errors import CalibrationError, OutputExistsError
 from fleetmap.geometry import Pose, rotations_from_quat_xyzw, so3_exp
 
 T0_NS = 1_650_000_000_123_456_789
@@ -87,6 +87,136 @@ def test_another_tool_reads_the_same(written):
     log_times = [log_time for _, log_time, _ in messages]
     assert log_times == sorted(log_times)
     assert log_times[0] == T0_NS
+
+
+def messages_on(path: Path) -> dict[str, list]:
+    """What rosbags' AnyReader reads, by topic."""
+    with AnyReader([path]) as reader:
+        messages: dict[str, list] = {topic: [] for topic in reader.topics}
+        for connection, log_time, raw in reader.messages():
+            message = reader.deserialize(raw, connection.msgtype)
+            messages[connection.topic].append(message)
+            if hasattr(message, "header"):
+                assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == log_time
+    return messages
+
+
+@pytest.mark.parametrize(
+    ("model", "coefficients"),
+    [
+        ("plumb_bob", (-0.3, 0.1, 0.001, -0.002, 0.01)),
+        ("rational_polynomial", (-0.3, 0.1, 0.001, -0.002, 0.01, 0.02, -0.03, 0.004)),
+        ("equidistant", (0.01, -0.02, 0.003, -0.0004)),
+    ],
+)
+def test_every_distortion_model_is_written_by_its_ros_name(tmp_path, pictures, model, coefficients):
+    camera = Camera(64, 48, 50.0, 51.0, 31.5, 23.5, coefficients, model)
+    with DriveWriter(tmp_path / "drive.mcap", camera) as writer:
+        writer.write_image(T0_NS, pictures[0])
+    (info,) = messages_on(tmp_path / "drive.mcap")["/camera/camera_info"]
+    assert (info.distortion_model, tuple(info.d)) == (model, coefficients)
+
+
+def test_an_imu_measurement_is_read_by_another_tool(tmp_path):
+    gyro_covariance = np.diag([1e-4, 2e-4, 3e-4])
+    with DriveWriter(tmp_path / "drive.mcap", None) as writer:
+        sample = ImuSample(T0_NS, np.array([0.1, -0.2, 0.3]), np.array([0.5, -0.25, 9.81]))
+        writer.write_imu(sample, "imu", angular_velocity_covariance=gyro_covariance)
+    (imu,) = messages_on(tmp_path / "drive.mcap")["/imu/data"]
+    gyro, accelerometer = imu.angular_velocity, imu.linear_acceleration
+    assert (gyro.x, gyro.y, gyro.z) == (0.1, -0.2, 0.3)
+    assert (accelerometer.x, accelerometer.y, accelerometer.z) == (0.5, -0.25, 9.81)
+    assert imu.header.frame_id == "imu"
+    assert imu.orientation_covariance[0] == -1.0  # it measures no orientation
+    assert np.array_equal(imu.angular_velocity_covariance.reshape(3, 3), gyro_covariance)
+    assert not imu.linear_acceleration_covariance.any()
+
+
+def test_a_wheel_speed_is_the_twist_along_x(tmp_path):
+    with DriveWriter(tmp_path / "drive.mcap", None) as writer:
+        writer.write_wheel_speed(WheelSpeed(T0_NS, -1.25))
+    (speed,) = messages_on(tmp_path / "drive.mcap")["/vehicle/speed"]
+    linear, angular = speed.twist.linear, speed.twist.angular
+    assert speed.header.frame_id == "base_link"
+    assert (linear.x, linear.y, linear.z, angular.x, angular.y, angular.z) == (-1.25, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+def test_a_depth_image_is_in_millimetres_with_zero_for_no_return(tmp_path):
+    depth_m = np.full((48, 64), 1.2344, dtype=np.float32)
+    depth_m[0, :6] = [0.0, np.nan, np.inf, -1.0, 65.535, 65.6]
+    with DriveWriter(tmp_path / "drive.mcap", CAMERA, camera_frame_id="cam", compress_chunks=True) as writer:
+        writer.write_depth(T0_NS, depth_m)
+    messages = messages_on(tmp_path / "drive.mcap")
+    (depth,), (info,) = messages["/camera/depth/image"], messages["/camera/depth/camera_info"]
+    assert (depth.encoding, depth.height, depth.width, depth.step) == ("16UC1", 48, 64, 128)
+    millimetres = depth.data.view("<u2").reshape(48, 64)
+    assert millimetres[0, :6].tolist() == [0, 0, 0, 0, 65535, 0]
+    assert np.unique(millimetres[1:]).tolist() == [1234]
+    assert (depth.header.frame_id, info.header.frame_id) == ("cam", "cam")
+    assert info.k == pytest.approx(CAMERA.matrix.reshape(9))
+
+
+def test_a_depth_image_of_another_size_is_refused_with_the_numbers(tmp_path):
+    with (
+        pytest.raises(CalibrationError, match=r"32x24 .* 64x48"),
+        DriveWriter(tmp_path / "drive.mcap", CAMERA) as writer,
+    ):
+        writer.write_depth(T0_NS, np.ones((24, 32), dtype=np.float32))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_scan_is_read_by_another_tool(tmp_path):
+    ranges_m = np.array([1.0, np.inf, 3.5, 2.25, 0.5], dtype=np.float32)
+    with DriveWriter(tmp_path / "drive.mcap", None) as writer:
+        writer.write_scan(
+            T0_NS, ranges_m, angle_min_rad=-1.0, angle_increment_rad=0.5, range_min_m=0.1, range_max_m=30.0,
+            scan_time_s=0.1,
+        )  # fmt: skip
+    (scan,) = messages_on(tmp_path / "drive.mcap")["/scan"]
+    assert np.array_equal(scan.ranges, ranges_m)
+    assert (scan.angle_min, scan.angle_max, scan.angle_increment) == (-1.0, 1.0, 0.5)
+    assert (scan.range_min, scan.range_max) == pytest.approx((0.1, 30.0))
+    assert (scan.scan_time, scan.time_increment) == pytest.approx((0.1, 0.02))
+
+
+def write_every_sensor(path: Path, pictures: list[np.ndarray], *, compress_chunks: bool) -> bytes:
+    with DriveWriter(path, CAMERA, compress_chunks=compress_chunks) as writer:
+        for index, picture in enumerate(pictures):
+            stamp_ns = T0_NS + index * FRAME_NS
+            writer.write_image(stamp_ns, picture)
+            writer.write_depth(stamp_ns, picture / 20.0)
+            writer.write_imu(ImuSample(stamp_ns + 1, np.zeros(3), np.array([0.0, 0.0, 9.8])), "imu")
+            writer.write_wheel_speed(WheelSpeed(stamp_ns + 2, 5.0))
+            writer.write_fix(GnssFix(stamp_ns + 3, 49.0, 8.0, 100.0, COVARIANCE), "camera")
+    return path.read_bytes()
+
+
+@pytest.mark.parametrize("compress_chunks", [False, True])
+def test_the_same_calls_give_the_same_bytes(tmp_path, pictures, compress_chunks):
+    first, second = (
+        write_every_sensor(tmp_path / name, pictures, compress_chunks=compress_chunks)
+        for name in ("a.mcap", "b.mcap")
+    )
+    assert first == second
+
+
+def test_compressed_chunks_are_smaller_and_hold_the_same(tmp_path, pictures):
+    plain = write_every_sensor(tmp_path / "plain.mcap", pictures, compress_chunks=False)
+    packed = write_every_sensor(tmp_path / "packed.mcap", pictures, compress_chunks=True)
+    assert 0 < len(packed) < 0.6 * len(plain)
+    before, after = messages_on(tmp_path / "plain.mcap"), messages_on(tmp_path / "packed.mcap")
+    assert before.keys() == after.keys()
+    for topic in ("/camera/depth/image", "/camera/image/compressed"):
+        assert [m.data.tobytes() for m in before[topic]] == [m.data.tobytes() for m in after[topic]]
+
+
+def test_depth_images_beside_the_camera_do_not_confuse_the_choice_of_topics(tmp_path, pictures):
+    write_every_sensor(tmp_path / "drive.mcap", pictures, compress_chunks=True)
+    drive = open_drive(tmp_path / "drive.mcap")
+    assert drive.camera == CAMERA
+    assert drive.frame_count == len(pictures)
+    frames = list(drive.frames())
+    assert np.abs(frames[3].image.astype(float) - pictures[3]).mean() < 2.0
 
 
 def test_a_jpeg_passes_through_byte_by_byte(tmp_path, pictures):
