@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO
 
-from mcap.reader import NonSeekingReader, SeekingReader
-from mcap.records import Channel, Message, Schema
-from mcap.summary import Summary
+from mcap.records import Channel, Schema
 
+from fleetmap.drives.mcap_index import MAGIC, DamagedBlock, Gap, McapIndex, Position, index_of_summary, messages_in_order
+from fleetmap.drives.mcap_scan import scan
 from fleetmap.errors import DriveError
 
-_MAGIC = b"\x89MCAP0\r\n"
-_RECORD_SIZE_LIMIT = 1 << 30
+_log = logging.getLogger(__name__)
 
-_McapMessage = tuple[Schema | None, Channel, Message]
+_NAMED_GAPS = 3  # a warning lists no more of them
 
 
 @dataclass(frozen=True)
@@ -41,110 +42,131 @@ class RawMessage:
 
 
 class McapFile:
-    """A complete MCAP file. Messages are streamed: at most a few chunks are in memory at a time."""
+    """An MCAP file. Messages are streamed: a chunk at a time, and of chunks that overlap in time about 64 MB.
+
+    A file without an index is scanned once, when it is opened. So is one whose end is missing, and, as soon as a
+    damaged chunk is met, one with an index; then one warning says what is left out.
+    """
 
     def __init__(self, path: Path) -> None:
-        """Check both ends and read the summary.
+        """Read the summary, or scan the file where it has none.
 
         Raises:
-            DriveError: not there, empty, not an MCAP, truncated, or damaged.
+            DriveError: not there, empty, not an MCAP, or unfinished or damaged so that no message is left.
         """
         self.path = path
-        with _opened(path) as file:
-            _check_both_ends(path, file)
-            self._is_indexed, topics = self._read_summary(file)
-        self.topics = topics if topics is not None else self._scan_topics()
+        with self._opened() as file:
+            _check_start(path, file)
+            self._index = index_of_summary(file) or scan(file)
+        self._has_told = False
+        self._check_something_is_left()
+        self.topics = _topics_of(self._index)
 
     def messages(self, *topics: str) -> Iterator[RawMessage]:
-        """The messages of some topics, in log-time order (in file order if the file has no index).
+        """The messages of some topics, in log-time order.
 
         Raises:
-            DriveError: the file is damaged.
+            DriveError: the file cannot be read any more, or nothing in it can.
         """
-        for _, channel, message in self._stream(topics):
-            yield RawMessage(channel.topic, message.log_time, message.data)
-
-    def _read_summary(self, file: IO[bytes]) -> tuple[bool, dict[str, Topic] | None]:
-        """Whether chunks can be found by an index, and the topics if the summary counts their messages."""
-        try:
-            summary = SeekingReader(file, record_size_limit=_RECORD_SIZE_LIMIT).get_summary()
-        except Exception as error:  # a parser fed with foreign bytes
-            raise _damaged(self.path, error) from error
-        if summary is None or not summary.channels:
-            return False, None
-        names_all_schemas = all(c.schema_id in summary.schemas for c in summary.channels.values() if c.schema_id)
-        is_indexed = bool(summary.chunk_indexes) and names_all_schemas
-        return is_indexed, _topics_of(summary) if summary.statistics and names_all_schemas else None
-
-    def _scan_topics(self) -> dict[str, Topic]:
-        """Topics and counts of a file that ends without them: one pass over all messages."""
-        topics: dict[str, Topic] = {}
-        for schema, channel, _ in self._stream(None):
-            counted = topics.get(channel.topic) or _topic(schema, channel, 0)
-            topics[channel.topic] = replace(counted, message_count=counted.message_count + 1)
-        return topics
-
-    def _stream(self, topics: tuple[str, ...] | None) -> Iterator[_McapMessage]:
-        with _opened(self.path) as file:
-            reader: SeekingReader | NonSeekingReader
-            if self._is_indexed:
-                reader = SeekingReader(file, validate_crcs=True, record_size_limit=_RECORD_SIZE_LIMIT)
-            else:
-                reader = NonSeekingReader(file, validate_crcs=True, record_size_limit=_RECORD_SIZE_LIMIT)
-            messages = reader.iter_messages(topics, log_time_order=self._is_indexed)
+        after: Position | None = None
+        with self._opened() as file:
             while True:
+                self._tell_what_is_missing()
+                index = self._index
+                ids = {channel.id for channel in index.channels.values() if channel.topic in topics}
                 try:
-                    message = next(messages)
-                except StopIteration:
+                    for after, channel_id, data in messages_in_order(file, index, ids, after):
+                        yield RawMessage(index.channels[channel_id].topic, after[0], data)
                     return
-                except Exception as error:  # decompressors and parsers fed with damaged bytes
-                    raise _damaged(self.path, error) from error
-                yield message
+                except DamagedBlock:
+                    self._rescan(file)
+
+    def _rescan(self, file: IO[bytes]) -> None:
+        self._index = scan(file)
+        self._check_something_is_left()
+        self.topics = _topics_of(self._index)
+
+    def _check_something_is_left(self) -> None:
+        index = self._index
+        if index.message_count or (index.unfinished_bytes is None and not index.gaps):
+            return
+        state = "damaged" if index.unfinished_bytes is None else "truncated (it does not end like an MCAP file)"
+        reason = f"; {index.gaps[0].reason}" if index.gaps else ""
+        raise DriveError(f"recording {self.path} is {state} and no message in it can be read{reason}; copy it again")
+
+    def _tell_what_is_missing(self) -> None:
+        """One warning a file, as soon as its messages are asked for."""
+        if not self._has_told and (losses := _losses(self._index)):
+            self._has_told = True
+            _log.warning(
+                "recording %s %s; %d messages are read", self.path, "; it ".join(losses), self._index.message_count
+            )
+
+    @contextmanager
+    def _opened(self) -> Iterator[IO[bytes]]:
+        try:
+            with self.path.open("rb") as file:
+                yield file
+        except OSError as error:
+            raise DriveError(f"cannot read recording {self.path}: {error.strerror or error}") from error
 
 
-def _opened(path: Path) -> IO[bytes]:
-    try:
-        return path.open("rb")
-    except OSError as error:
-        raise DriveError(f"cannot read recording {path}: {error.strerror or error}") from error
-
-
-def _check_both_ends(path: Path, file: IO[bytes]) -> None:
-    start = file.read(len(_MAGIC))
+def _check_start(path: Path, file: IO[bytes]) -> None:
+    start = file.read(len(MAGIC))
     if not start:
         raise DriveError(f"recording {path} is empty (0 bytes); record or convert it again")
-    if start != _MAGIC[: len(start)]:
+    if start != MAGIC[: len(start)]:
         raise DriveError(f"{path} is not an MCAP file; fleetmap reads MCAP recordings with ROS 2 messages")
-    size = file.seek(0, 2)
-    file.seek(max(0, size - len(_MAGIC)))
-    if size < 2 * len(_MAGIC) or file.read() != _MAGIC:
-        raise DriveError(
-            f"recording {path} is truncated (it does not end like an MCAP file); copy it again,"
-            " or repair it with 'mcap recover'"
+
+
+def _losses(index: McapIndex) -> list[str]:
+    """What cannot be read, each as the end of a sentence about the recording."""
+    losses = []
+    if index.gaps:
+        are_chunks = any(block.is_chunk for block in index.blocks)
+        one, many = ("chunk", "chunks") if are_chunks else ("stretch", "stretches")
+        count = f"1 {one}" if len(index.gaps) == 1 else f"{len(index.gaps)} {many}"
+        places = "; ".join(_place(index, gap) for gap in index.gaps[:_NAMED_GAPS])
+        more = "; ..." if len(index.gaps) > _NAMED_GAPS else ""
+        losses.append(f"is damaged: {count} cannot be read and left out ({places}{more})")
+    elif index.is_doubtful:
+        losses.append("is damaged: its checksum does not fit, and some of its messages may be wrong")
+    if index.unfinished_bytes is not None:
+        losses.append(
+            "was not finished (its recorder lost power, or the copy is incomplete):"
+            f" {index.unfinished_bytes} bytes at its end are left out"
         )
-    file.seek(0)
+    return losses
 
 
-def _topics_of(summary: Summary) -> dict[str, Topic]:
-    counts = summary.statistics.channel_message_counts if summary.statistics else {}
+def _place(index: McapIndex, gap: Gap) -> str:
+    """Where a gap is, in bytes and in seconds since the recording's first message that can be read."""
+    before = max((b for b in index.blocks if b.offset < gap.begin), key=lambda b: b.offset, default=None)
+    behind = min((b for b in index.blocks if b.offset > gap.begin), key=lambda b: b.offset, default=None)
+    start_ns = gap.start_ns if gap.start_ns is not None else before.end_ns if before else None
+    end_ns = gap.end_ns if gap.end_ns is not None else behind.start_ns if behind else None
+    place = f"bytes {gap.begin} to {gap.end}"
+    if start_ns is None or end_ns is None or end_ns < start_ns:
+        return place
+    first_ns = min(block.start_ns for block in index.blocks)
+    return f"{place}, {(start_ns - first_ns) * 1e-9:.1f} to {(end_ns - first_ns) * 1e-9:.1f} s after its start"
+
+
+def _topics_of(index: McapIndex) -> dict[str, Topic]:
     topics: dict[str, Topic] = {}
-    for channel in summary.channels.values():
-        known = topics.get(channel.topic) or _topic(summary.schemas.get(channel.schema_id), channel, 0)
-        topics[channel.topic] = replace(known, message_count=known.message_count + counts.get(channel.id, 0))
+    for channel in index.channels.values():
+        known = topics.get(channel.topic) or _topic(index.schemas.get(channel.schema_id), channel)
+        count = known.message_count + index.message_counts.get(channel.id, 0)
+        topics[channel.topic] = replace(known, message_count=count)
     return dict(sorted(topics.items()))
 
 
-def _topic(schema: Schema | None, channel: Channel, message_count: int) -> Topic:
+def _topic(schema: Schema | None, channel: Channel) -> Topic:
     return Topic(
         name=channel.topic,
         message_type=schema.name if schema else "",
         message_encoding=channel.message_encoding,
         schema_encoding=schema.encoding if schema else "",
         schema_text=schema.data.decode("utf-8", errors="replace") if schema else "",
-        message_count=message_count,
+        message_count=0,
     )
-
-
-def _damaged(path: Path, error: Exception) -> DriveError:
-    reason = f"{type(error).__name__}: {error}".rstrip(": ").splitlines()[0]
-    return DriveError(f"recording {path} is damaged ({reason}); copy it again, or repair it with 'mcap recover'")
