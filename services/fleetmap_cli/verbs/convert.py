@@ -6,8 +6,8 @@ from pathlib import Path
 
 import click
 
-from fleetmap.drives.kitti import Conversion
-from fleetmap.drives.kitti_odometry import Origin, SimulatedGnss, convert_kitti_odometry
+from fleetmap.drives.conversion import Conversion, SimulatedGnss
+from fleetmap.drives.kitti_odometry import Origin, convert_kitti_odometry
 from fleetmap.drives.kitti_raw import convert_kitti_raw
 from fleetmap.gnss import GNSS_ERROR_MODELS
 from fleetmap_cli.options import XYZ, Numbers

@@ -10,76 +10,29 @@ import calendar
 import csv
 import re
 import time
-from collections.abc import Iterable
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
 
 from fleetmap.camera import Camera
+from fleetmap.drives.conversion import StampedImage, read_bytes, read_lines
 from fleetmap.drives.image_codec import decode_compressed
-from fleetmap.drives.ros2_writer import DriveWriter
 from fleetmap.errors import CalibrationError, DriveError
 from fleetmap.geometry import Array, Pose, rotations_from_quat_xyzw
-from fleetmap.trajectory import Trajectory, write_trajectory
+from fleetmap.trajectory import Trajectory
 
 _IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 
 
 @dataclass(frozen=True)
-class StampedImage:
-    """One image file of a data set."""
+class NumberedImage(StampedImage):
+    """One image file whose name is its number."""
 
-    frame: int  # the number that names the file
-    stamp_ns: int
-    path: Path
+    frame: int
 
 
-@dataclass(frozen=True)
-class Conversion:
-    """What a conversion has written."""
-
-    recording: Path
-    frame_count: int
-    fix_count: int
-    reference: Path | None  # NAME.reference.tum, where the folder holds a reference
-
-
-def reference_path(recording: Path) -> Path:
-    """``survey.mcap`` -> ``survey.reference.tum``."""
-    return recording.with_name(f"{recording.stem}.reference.tum")
-
-
-def write_reference(recording: Path, reference: Trajectory | None) -> Path | None:
-    """Write the reference beside its recording; an older one that belongs to nothing any more is removed."""
-    path = reference_path(recording)
-    if reference is None:
-        path.unlink(missing_ok=True)
-        return None
-    write_trajectory(path, reference)
-    return path
-
-
-def write_images(writer: DriveWriter, images: Iterable[StampedImage]) -> None:
-    """Copy image files into a recording without encoding them again.
-
-    Raises:
-        DriveError: a file that cannot be read, or an image that is not later than the one before.
-    """
-    before_ns: int | None = None
-    for image in images:
-        if before_ns is not None and image.stamp_ns <= before_ns:
-            raise DriveError(f"{image.path} is not later than the image before it; its timestamps are damaged")
-        before_ns = image.stamp_ns
-        data = read_bytes(image.path)
-        if image.path.suffix == ".png":
-            writer.write_png(image.stamp_ns, data)
-        else:
-            writer.write_jpeg(image.stamp_ns, data)
-
-
-def stamped_images(folder: Path, stamps_ns: dict[int, int], timestamps: Path) -> list[StampedImage]:
+def stamped_images(folder: Path, stamps_ns: dict[int, int], timestamps: Path) -> list[NumberedImage]:
     """The images of a folder in the order of their numbers, each with the stamp of that number.
 
     Raises:
@@ -91,7 +44,7 @@ def stamped_images(folder: Path, stamps_ns: dict[int, int], timestamps: Path) ->
     missing = sorted(found.keys() - stamps_ns.keys())
     if missing:
         raise DriveError(f"{found[missing[0]]} has no time: {timestamps} has no line for image {missing[0]}")
-    return [StampedImage(frame, stamps_ns[frame], found[frame]) for frame in sorted(found)]
+    return [NumberedImage(stamps_ns[frame], found[frame], frame) for frame in sorted(found)]
 
 
 def image_size_px(image: StampedImage) -> tuple[int, int]:
@@ -110,14 +63,6 @@ def read_clock_readings(path: Path) -> dict[int, int]:
         if line.strip():
             readings[number] = _clock_reading_ns(path, number, line)
     return readings
-
-
-def seconds_as_ns(text: str, origin: str) -> int:
-    """Decimal seconds, also like 1.037359e-01, as exact nanoseconds. Raises DriveError naming ``origin``."""
-    try:
-        return int((Decimal(text.strip()) * 1_000_000_000).to_integral_value())
-    except (InvalidOperation, ValueError, OverflowError) as error:
-        raise DriveError(f"{origin}: '{text.strip()}' is no time in seconds") from error
 
 
 def read_calibration(path: Path) -> dict[str, Array]:
@@ -166,7 +111,7 @@ def read_rigid_transform(path: Path) -> Pose:
     return Pose(calibration_entry(entries, "R", (3, 3), path), calibration_entry(entries, "T", (3,), path))
 
 
-def read_reference_csv(path: Path, images: list[StampedImage]) -> Trajectory:
+def read_reference_csv(path: Path, images: list[NumberedImage]) -> Trajectory:
     """Poses ``frame,...,easting,northing,alt,qx,qy,qz,qw`` of the images' numbers, at the images' stamps.
 
     Raises:
@@ -202,24 +147,6 @@ def find_reference_csv(folder: Path, camera: int) -> Path | None:
             f"{folder} holds {len(found)} references of camera {camera}: {found[0].name}, {found[1].name}"
         )
     return found[0] if found else None
-
-
-def read_lines(path: Path) -> list[str]:
-    """Lines of a text file. Raises DriveError if it cannot be read."""
-    try:
-        return path.read_text(encoding="utf-8").splitlines()
-    except OSError as error:
-        raise DriveError(f"cannot read {path}: {error.strerror or error}") from error
-    except UnicodeDecodeError as error:
-        raise DriveError(f"{path} is not a text file: {error}") from error
-
-
-def read_bytes(path: Path) -> bytes:
-    """A file's bytes. Raises DriveError if it cannot be read."""
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise DriveError(f"cannot read {path}: {error.strerror or error}") from error
 
 
 def _listed(folder: Path) -> list[Path]:

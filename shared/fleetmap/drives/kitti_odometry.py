@@ -13,27 +13,35 @@ import numpy as np
 
 from fleetmap.camera import Camera
 from fleetmap.drive import GnssFix
-from fleetmap.drives.kitti import (
+from fleetmap.drives.conversion import (
     Conversion,
-    StampedImage,
+    Progress,
+    SimulatedGnss,
+    fix_messages,
+    image_messages,
+    mount_antenna,
+    read_lines,
+    seconds_as_ns,
+    silent,
+    simulated_fixes,
+    write_in_time_order,
+    write_reference,
+)
+from fleetmap.drives.kitti import (
+    NumberedImage,
     baseline_shift_m,
     calibration_entry,
     find_reference_csv,
     image_size_px,
     pinhole,
     read_calibration,
-    read_lines,
     read_reference_csv,
-    seconds_as_ns,
     stamped_images,
-    write_images,
-    write_reference,
 )
 from fleetmap.drives.ros2_writer import DriveWriter
 from fleetmap.errors import CalibrationError, DriveError
 from fleetmap.geodesy import UtmGrid
 from fleetmap.geometry import Array, Pose
-from fleetmap.gnss import GNSS_ERROR_MODELS, sample_fixes
 from fleetmap.trajectory import Trajectory
 
 START_NS = 1_700_000_000 * 1_000_000_000  # 2023-11-14T22:13:20Z: where recordings with relative times start
@@ -47,17 +55,6 @@ class Origin:
     lon_deg: float
     height_m: float  # above the ellipsoid
     heading_deg: float  # clockwise from true north
-
-
-@dataclass(frozen=True)
-class SimulatedGnss:
-    """How fixes are made from the reference; see fleetmap.gnss.sample_fixes."""
-
-    error: str  # "rtk" or "consumer"
-    interval_s: float = 0.1
-    gap_s: tuple[float, float] | None = None
-    antenna_in_camera_m: tuple[float, float, float] | None = None  # None: the antenna is the camera centre
-    seed: int = 0
 
 
 @dataclass(frozen=True)
@@ -78,6 +75,7 @@ def convert_kitti_odometry(
     gnss: SimulatedGnss | None = None,
     origin: Origin | None = None,
     force: bool = False,
+    progress: Progress = silent,
 ) -> Conversion:
     """Write one camera of a KITTI odometry sequence as MCAP; with ``gnss`` also fixes made from its reference.
 
@@ -92,6 +90,7 @@ def convert_kitti_odometry(
         gnss: how to make fixes; None for a recording without GNSS.
         origin: where to place poses that have no site.
         force: replace an existing output.
+        progress: called with the stage, the images done, and all of them.
 
     Raises:
         DriveError: not a KITTI odometry folder, a damaged one, or one without the reference that GNSS needs.
@@ -112,15 +111,10 @@ def convert_kitti_odometry(
         image_topic=f"/cam{camera}/image/compressed",
         info_topic=f"/cam{camera}/camera_info",
     ) as writer:
-        write_images(writer, images)
-        gnss_frame_id = frame_id
-        if gnss and gnss.antenna_in_camera_m is not None:
-            gnss_frame_id = "gnss"
-            writer.write_static_transform(
-                frame_id, gnss_frame_id, Pose(np.eye(3), np.array(gnss.antenna_in_camera_m, dtype=np.float64))
-            )
-        for fix in fixes:
-            writer.write_fix(fix, gnss_frame_id)
+        gnss_frame_id = mount_antenna(writer, frame_id, gnss.antenna_in_camera_m if gnss else None)
+        write_in_time_order(
+            image_messages(writer, images, calibrated, progress), fix_messages(writer, fixes, gnss_frame_id)
+        )
     return Conversion(output, len(images), len(fixes), write_reference(output, reference))
 
 
@@ -204,7 +198,7 @@ def _read_matrix(path: Path) -> Array:
 
 
 def _read_reference(
-    layout: _Layout, images: list[StampedImage], cam0_from_camera: Pose, origin: Origin | None
+    layout: _Layout, images: list[NumberedImage], cam0_from_camera: Pose, origin: Origin | None
 ) -> Trajectory | None:
     if origin is None:
         return read_reference_csv(layout.reference_csv, images) if layout.reference_csv else None
@@ -243,11 +237,4 @@ def _make_fixes(folder: Path, reference: Trajectory | None, gnss: SimulatedGnss)
             f"{folder} has no reference in UTM to make GNSS fixes from; a sequence with poses can be placed"
             " with --origin LAT,LON,HEIGHT,HEADING_DEG"
         )
-    return sample_fixes(
-        reference,
-        GNSS_ERROR_MODELS[gnss.error],
-        interval_s=gnss.interval_s,
-        gap_s=gnss.gap_s,
-        antenna_in_cam_m=gnss.antenna_in_camera_m or (0.0, 0.0, 0.0),
-        seed=gnss.seed,
-    )
+    return simulated_fixes(reference, gnss)

@@ -14,8 +14,18 @@ import numpy as np
 
 from fleetmap.camera import Camera
 from fleetmap.drive import GnssFix
-from fleetmap.drives.kitti import (
+from fleetmap.drives.conversion import (
     Conversion,
+    Progress,
+    fix_messages,
+    image_messages,
+    read_lines,
+    seconds_as_ns,
+    silent,
+    write_in_time_order,
+    write_reference,
+)
+from fleetmap.drives.kitti import (
     baseline_shift_m,
     calibration_entry,
     find_reference_csv,
@@ -23,13 +33,9 @@ from fleetmap.drives.kitti import (
     pinhole,
     read_calibration,
     read_clock_readings,
-    read_lines,
     read_reference_csv,
     read_rigid_transform,
-    seconds_as_ns,
     stamped_images,
-    write_images,
-    write_reference,
 )
 from fleetmap.drives.ros2_writer import DriveWriter
 from fleetmap.errors import CalibrationError, DriveError
@@ -55,7 +61,13 @@ class _MountedCamera:
 
 
 def convert_kitti_raw(
-    folder: Path, output: Path, *, camera: int = 0, gnss: bool = True, force: bool = False
+    folder: Path,
+    output: Path,
+    *,
+    camera: int = 0,
+    gnss: bool = True,
+    force: bool = False,
+    progress: Progress = silent,
 ) -> Conversion:
     """Write one camera of a KITTI raw drive as MCAP, with its OXTS positions as NavSatFix of frame ``imu``.
 
@@ -80,11 +92,11 @@ def convert_kitti_raw(
         image_topic=f"/cam{camera}/image/compressed",
         info_topic=f"/cam{camera}/camera_info",
     ) as writer:
-        write_images(writer, images)
         if gnss:
             _write_mounting(writer, layout, mounted)
-        for fix in fixes:
-            writer.write_fix(fix, "imu")
+        write_in_time_order(
+            image_messages(writer, images, mounted.camera, progress), fix_messages(writer, fixes, "imu")
+        )
     return Conversion(output, len(images), len(fixes), write_reference(output, reference))
 
 
