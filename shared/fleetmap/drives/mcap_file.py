@@ -11,7 +11,15 @@ from typing import IO
 
 from mcap.records import Channel, Schema
 
-from fleetmap.drives.mcap_index import MAGIC, DamagedBlock, Gap, McapIndex, Position, index_of_summary, messages_in_order
+from fleetmap.drives.mcap_index import (
+    MAGIC,
+    DamagedBlockError,
+    Gap,
+    McapIndex,
+    Position,
+    index_of_summary,
+    messages_in_order,
+)
 from fleetmap.drives.mcap_scan import scan
 from fleetmap.errors import DriveError
 
@@ -28,8 +36,13 @@ class Topic:
     message_type: str  # such as sensor_msgs/msg/Image
     message_encoding: str  # "cdr" for ROS 2
     schema_encoding: str  # "ros2msg" or "ros2idl"
-    schema_text: str
+    schema_data: bytes  # a text for ROS 2, a binary descriptor for protobuf
     message_count: int
+
+    @property
+    def schema_text(self) -> str:
+        """The schema as text."""
+        return self.schema_data.decode("utf-8", errors="replace")
 
 
 @dataclass(frozen=True)
@@ -75,10 +88,11 @@ class McapFile:
                 index = self._index
                 ids = {channel.id for channel in index.channels.values() if channel.topic in topics}
                 try:
-                    for after, channel_id, data in messages_in_order(file, index, ids, after):
-                        yield RawMessage(index.channels[channel_id].topic, after[0], data)
+                    for position, channel_id, data in messages_in_order(file, index, ids, after):
+                        after = position
+                        yield RawMessage(index.channels[channel_id].topic, position[0], data)
                     return
-                except DamagedBlock:
+                except DamagedBlockError:
                     self._rescan(file)
 
     def _rescan(self, file: IO[bytes]) -> None:
@@ -90,9 +104,9 @@ class McapFile:
         index = self._index
         if index.message_count or (index.unfinished_bytes is None and not index.gaps):
             return
-        state = "damaged" if index.unfinished_bytes is None else "truncated (it does not end like an MCAP file)"
+        state = "damaged" if index.unfinished_bytes is None else "truncated"
         reason = f"; {index.gaps[0].reason}" if index.gaps else ""
-        raise DriveError(f"recording {self.path} is {state} and no message in it can be read{reason}; copy it again")
+        raise DriveError(f"recording {self.path} is {state}: no message in it can be read{reason}; copy it again")
 
     def _tell_what_is_missing(self) -> None:
         """One warning a file, as soon as its messages are asked for."""
@@ -167,6 +181,6 @@ def _topic(schema: Schema | None, channel: Channel) -> Topic:
         message_type=schema.name if schema else "",
         message_encoding=channel.message_encoding,
         schema_encoding=schema.encoding if schema else "",
-        schema_text=schema.data.decode("utf-8", errors="replace") if schema else "",
+        schema_data=schema.data if schema else b"",
         message_count=0,
     )
