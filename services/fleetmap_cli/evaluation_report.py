@@ -10,14 +10,12 @@ from numpy.typing import NDArray
 from fleetmap.evaluation import ErrorStatistics, Judgement, Nees, TrajectoryErrors, WindowErrors
 from fleetmap.yardstick import compare_with_yardstick
 
-TITLES = {
+_TITLES = {
     "reference": "against the reference",
     "compare": "of the compared trajectory against the reference",
-    "spline": "of the cubic GNSS spline",
-    "smoothing_spline": "of the smoothing GNSS spline",
     "against_map": "relative to the map's trajectory",
 }
-ROWS = ("max", "mean", "median", "min", "rmse", "sse", "std", "p95")
+_ROWS = ("max", "mean", "median", "min", "rmse", "sse", "std", "p95")
 
 _YARDSTICKS = {
     "spline": ("spline", "cubic through the GNSS fixes alone, antenna taken as the camera, never aligned"),
@@ -38,7 +36,7 @@ def report(judged: Mapping[str, Judgement]) -> Iterator[list[str]]:
                 lines += _yardstick_remarks(judged[yardstick], *_YARDSTICKS[yardstick])
         if name != "against_map" and "smoothing_spline" in judged:
             lines += _verdict(judged[name].errors, judged["smoothing_spline"].errors)
-        yield [f"Position error {TITLES[name]} (m; sse in m^2)", *_table(columns), *lines]
+        yield [f"Position error {_TITLES[name]} (m; sse in m^2)", *_table(columns), *lines]
 
 
 def _columns(prefix: str, errors: TrajectoryErrors) -> dict[str, ErrorStatistics]:
@@ -47,7 +45,7 @@ def _columns(prefix: str, errors: TrajectoryErrors) -> dict[str, ErrorStatistics
 
 def _table(columns: dict[str, ErrorStatistics]) -> Iterator[str]:
     yield f"  {'':8}" + "".join(f"{name:>19}" for name in columns)
-    for row in ROWS:
+    for row in _ROWS:
         yield f"  {row:8}" + "".join(f"{getattr(column, row):>19.4f}" for column in columns.values())
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleetmap.camera import Camera
+from fleetmap.covariances import PoseCovariances
 from fleetmap.drive import Frame
 from fleetmap.errors import NoPoseError
 from fleetmap.trajectory import Trajectory
@@ -40,6 +41,13 @@ class LocalizedDrive:
             stamps_ns=np.array([pose.stamp_ns for pose in self.poses], dtype=np.int64),
             positions_m=np.array([pose.utm_from_cam.translation_m for pose in self.poses]),
             rotations=np.array([pose.utm_from_cam.rotation for pose in self.poses]),
+        )
+
+    def covariances(self) -> PoseCovariances:
+        """The covariances of the poses, relative to the map."""
+        return PoseCovariances(
+            stamps_ns=np.array([pose.stamp_ns for pose in self.poses], dtype=np.int64),
+            matrices=np.array([pose.covariance for pose in self.poses]),
         )
 
 

@@ -31,8 +31,17 @@ _INTENSITY_GRID = np.geomspace(1e-5, 1e3, 9)  # m^2/s^3, from a ship to a stunt
 _SIGMA_GRID = np.array([0.03, 0.1, 0.3, 1.0, 3.0])
 
 
-def fit_smoothing_spline(times_s: Array, values: Array, variances: Array) -> Array:
-    """Smoothed values (N, K) of K axes that share their smoothness; the natural cubic spline through them is it.
+@dataclass(frozen=True)
+class SmoothedValues:
+    """Values at the knots of a smoothing spline, and what was found out about road and receiver."""
+
+    values: Array  # (N, K); the natural cubic spline through them is the smoothing spline
+    intensity_m2_s3: float  # q, of the acceleration's white noise
+    sigma_factor: float  # s, by which the reported sigmas are too small
+
+
+def fit_smoothing_spline(times_s: Array, values: Array, variances: Array) -> SmoothedValues:
+    """The smoothing spline of K axes that share their smoothness and their receiver's honesty.
 
     Args:
         times_s: (N,) strictly increasing, N >= 2.
@@ -42,7 +51,7 @@ def fit_smoothing_spline(times_s: Array, values: Array, variances: Array) -> Arr
     With fewer than three values nothing can be smoothed: they are returned as they are.
     """
     if len(times_s) < 3:
-        return values.copy()
+        return SmoothedValues(values.copy(), intensity_m2_s3=0.0, sigma_factor=1.0)
     system = _System.of(times_s)
     intensity, sigma_factor = _likeliest(system, values, variances)
     smoothed = np.empty_like(values)
@@ -51,7 +60,7 @@ def fit_smoothing_spline(times_s: Array, values: Array, variances: Array) -> Arr
         factor = cholesky_banded(system.covariance(intensity, noise), lower=True)
         weights = cho_solve_banded((factor, True), system.differences(values[:, axis]))
         smoothed[:, axis] = values[:, axis] - noise * system.transposed_differences(weights)
-    return smoothed
+    return SmoothedValues(smoothed, intensity, sigma_factor)
 
 
 def _likeliest(system: _System, values: Array, variances: Array) -> tuple[float, float]:

@@ -65,7 +65,8 @@ def evaluate_smoothing_spline(
     compared = known.span(reference)
     smoothed_m = known.positions_m - known.positions_m[0]
     for axes in (slice(0, 2), slice(2, 3)):
-        smoothed_m[:, axes] = fit_smoothing_spline(known.times_s, smoothed_m[:, axes], known.variances_m2[:, axes])
+        fit = fit_smoothing_spline(known.times_s, smoothed_m[:, axes], known.variances_m2[:, axes])
+        smoothed_m[:, axes] = fit.values
     spline = CubicSpline(known.times_s, smoothed_m, bc_type="natural")
     at_s = known.since_first_s(reference.stamps_ns[compared])
     positions_m = spline(at_s) + known.positions_m[0]

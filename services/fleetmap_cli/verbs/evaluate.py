@@ -17,7 +17,7 @@ from fleetmap.covariances import PoseCovariances, read_covariances
 from fleetmap.errors import InputError
 from fleetmap.evaluation import Alignment, Judgement, evaluate_against_map, evaluate_trajectory, judge
 from fleetmap.trajectory import Trajectory, read_trajectory
-from fleetmap_cli.evaluation_report import TITLES, report
+from fleetmap_cli.evaluation_report import report
 from fleetmap_cli.options import XYZ
 
 _FILE = click.Path(path_type=Path)
@@ -249,27 +249,36 @@ def _require_drawable(plot: Path) -> None:
     require_picture_name(plot)
 
 
-def _draw(plot: Path, inputs: _Inputs, judged: dict[str, Judgement], landmarks: Path | None) -> None:
-    from fleetmap_cli.plotting import Track, plot_evaluation
+# entry -> name and colour in the picture
+_LOOKS = {
+    "reference": ("estimate", "C0"),
+    "compare": ("compared", "C3"),
+    "spline": ("GNSS alone, cubic", "C1"),
+    "smoothing_spline": ("GNSS alone, smoothing spline", "C4"),
+    "against_map": ("estimate relative to the map", "C2"),
+}
 
-    tracks = []
-    for name, label, trajectory, style in (
-        ("reference", "estimate", inputs.estimate, "C0.-"),
-        ("compare", "compared", inputs.compare, "C3-"),
-    ):
-        if trajectory is not None:
-            aligned = name in judged and judged[name].errors.scale is not None
-            positions_m = judged[name].errors.positions_m if aligned else trajectory.positions_m
-            tracks.append(Track(f"{label}, aligned" if aligned else label, positions_m, style))
+
+def _draw(plot: Path, inputs: _Inputs, judged: dict[str, Judgement], landmarks: Path | None) -> None:
+    from fleetmap_cli.plotting import ErrorLine, Track, plot_evaluation
+
+    tracks = [] if "reference" in judged else [Track("estimate", inputs.estimate.positions_m, "C0.-")]
+    given = {"reference": inputs.estimate, "compare": inputs.compare}
+    for name, (label, colour) in _LOOKS.items():
+        if name not in judged or name == "against_map":
+            continue
+        trajectory, errors = given.get(name), judged[name].errors
+        if trajectory is None or errors.scale is not None:
+            tracks.append(Track(label if trajectory is None else f"{label}, aligned", errors.positions_m, colour))
+        else:
+            tracks.append(Track(label, trajectory.positions_m, f"{colour}.-"))
     if inputs.survey is not None:
         tracks.append(Track("trajectory of the map", inputs.survey.positions_m, "C2-"))
-    for name, label, style in (("spline", "cubic", "C1-"), ("smoothing_spline", "smoothing spline", "C4-")):
-        if name in judged:
-            tracks.append(Track(f"GNSS alone, {label}", judged[name].errors.positions_m, style))
     if inputs.reference is not None:
         tracks.append(Track("reference", inputs.reference.positions_m, "k--"))
+    lines = [ErrorLine(label, judged[name], colour) for name, (label, colour) in _LOOKS.items() if name in judged]
     points_m = None if landmarks is None else _read_landmarks_m(landmarks, inputs.estimate.epsg)
-    plot_evaluation(plot, tracks, {TITLES[name]: entry for name, entry in judged.items()}, points_m)
+    plot_evaluation(plot, tracks, lines, points_m)
 
 
 def _read_landmarks_m(folder: Path, epsg: int) -> np.ndarray:

@@ -10,6 +10,7 @@ from pathlib import Path
 import click
 from tqdm import tqdm
 
+from fleetmap.covariances import write_covariances
 from fleetmap.drive import Drive
 from fleetmap.drives import open_drive
 from fleetmap.errors import DriveError
@@ -34,6 +35,13 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
     "--trajectory", type=_FILE, required=True, metavar="OUT.tum", help="Write the poses here (TUM text, UTM)."
 )
 @click.option(
+    "--covariances",
+    type=_FILE,
+    metavar="OUT.csv",
+    help="Write the poses' covariances, relative to the map, here: stamp_ns and the upper triangle of [rotation "
+    "(rad), translation (m)] in the camera's frame.",
+)
+@click.option(
     "--near", type=LAT_LON, help="With --server: choose among the maps within 1 km of here, nearest first."
 )
 @click.option(
@@ -49,6 +57,7 @@ def localize(
     server: str | None,
     map_: str | None,
     trajectory: Path,
+    covariances: Path | None,
     near: tuple[float, float] | None,
     use_gnss: bool,
     image_topic: str | None,
@@ -80,11 +89,15 @@ def localize(
         )
         result = localize_drive(frames, camera, maps)
     write_trajectory(trajectory, result.trajectory())
+    if covariances is not None:
+        write_covariances(covariances, result.covariances())
     click.echo(f"map:            {result.map_id} (version {result.version[:12]})")
     click.echo(f"frames:         {result.frame_count}")
     click.echo(f"poses:          {len(result.poses)} ({100.0 * len(result.poses) / result.frame_count:.1f} %)")
     click.echo(f"median inliers: {result.median_inliers}")
     click.echo(f"trajectory:     {trajectory}")
+    if covariances is not None:
+        click.echo(f"covariances:    {covariances}")
 
 
 @contextmanager

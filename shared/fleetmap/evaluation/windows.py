@@ -100,8 +100,8 @@ def fit_windows(errors: TrajectoryErrors, window_m: float = WINDOW_M, step_m: fl
 
 def _spans(driven_m: Array, window_m: float, step_m: float) -> tuple[Indices, Indices]:
     """First and last compared pose (K,), (K,) of every window that fits whole."""
-    _, firsts = np.unique(np.floor((driven_m - driven_m[0]) / step_m), return_index=True)
-    # A nanometre less: steps that should add up to the window do so only but for rounding.
+    # A trifle off: steps that should add up to a metre or to the window do so only but for rounding.
+    _, firsts = np.unique(np.floor((driven_m - driven_m[0]) / step_m + 1e-6), return_index=True)
     lasts = np.searchsorted(driven_m, driven_m[firsts] + (window_m - 1e-9))
     whole = lasts < len(driven_m)
     return firsts[whole], lasts[whole]
