@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 
 from fleetmap.camera import Camera
+from fleetmap.covariances import PoseCovariances, write_covariances
 from fleetmap.drive import GnssFix
 from fleetmap.drives.ros2_writer import DriveWriter
 from fleetmap.geodesy import UtmGrid
 from fleetmap.geometry import so3_exp
+from fleetmap.map_package import open_package
 from fleetmap.trajectory import Trajectory, write_trajectory
 from fleetmap_cli.main import main
 
@@ -19,8 +21,7 @@ START_NS = 1_700_000_000_000_000_000
 OFFSET_IN_CAM_M = (-0.54, 0.02, 0.1)
 
 
-def straight_drive(epsg: int = 32632) -> Trajectory:
-    count = 50
+def straight_drive(epsg: int = 32632, count: int = 50) -> Trajectory:
     stamps_ns = START_NS + np.arange(count, dtype=np.int64) * 100_000_000
     positions_m = np.array([455_300.0, 5_425_500.0, 120.0]) + np.arange(count)[:, None] * [0.3, 0.8, 0.0]
     forward = so3_exp(np.array([0.0, 0.0, -0.36])) @ so3_exp(np.array([-np.pi / 2.0, 0.0, 0.0]))
@@ -137,6 +138,123 @@ def test_the_plot_is_a_picture_and_replaces_an_older_one(files: Path) -> None:
     assert not list(files.glob(".*"))
 
 
+def test_landmarks_beside_the_road_are_drawn(map_package: Path, tmp_path: Path) -> None:
+    content = open_package(map_package).localization_map()
+    keyframes = content.keyframes
+    drive = Trajectory(
+        content.anchor.epsg,
+        keyframes.stamps_ns,
+        content.anchor.utm_from_map(keyframes.positions_m),
+        keyframes.rotations,
+    )
+    survey, without, with_ = (tmp_path / name for name in ("survey.tum", "without.png", "with.png"))
+    write_trajectory(survey, drive)
+    assert run(str(survey), str(survey), "--plot", str(without)) == 0
+    assert run(str(survey), str(survey), "--plot", str(with_), "--landmarks", str(map_package)) == 0
+    assert without.read_bytes() != with_.read_bytes()
+
+
+def test_landmarks_of_another_zone_are_refused(
+    files: Path, map_package: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["other_zone.tum", "other_zone.tum", "--plot", "out.png", "--landmarks", str(map_package)]
+    assert run(*arguments) == 2
+    assert "EPSG:32632, the trajectory in EPSG:32633" in capsys.readouterr().err
+    assert not (files / "out.png").exists()
+
+
+def test_a_map_far_from_the_road_leaves_the_picture_as_it_is(files: Path, map_package: Path) -> None:
+    judged = ["estimate.tum", "reference.tum", "--plot", "out.png", "--landmarks", str(map_package)]
+    assert run(*judged) == 0
+    assert (files / "out.png").is_file()
+
+
+def test_a_drive_shorter_than_the_window_has_no_windows_and_says_so(
+    files: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("estimate.tum", "reference.tum", "--json") == 0
+    figures = json.loads(capsys.readouterr().out)["reference"]
+    assert figures["windows"] is None
+    assert figures["intervals"]["position_m"]["mean"] is None
+    assert run("estimate.tum", "reference.tum") == 0
+    out = capsys.readouterr().out
+    assert "windows of 50 m: none fits, the compared poses span 41.9 m of road" in out
+    assert "no intervals: 41.9 m of road are one segment only" in out
+
+
+@pytest.fixture
+def long_files(files: Path) -> Path:
+    """long.tum, 400 m, and drifting.tum: a hundredth longer, 0.1 m of noise."""
+    truth = straight_drive(count=470)
+    write_trajectory(files / "long.tum", truth)
+    noise = np.random.default_rng(0).normal(0.0, 0.1, truth.positions_m.shape)
+    along = truth.positions_m - truth.positions_m[0]
+    write_trajectory(files / "drifting.tum", shifted(truth, 0.01 * along + noise))
+    return files
+
+
+@pytest.mark.usefixtures("long_files")
+def test_windows_and_intervals_are_printed_and_in_the_json(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("drifting.tum", "long.tum", "--window-m", "40", "--json") == 0
+    figures = json.loads(capsys.readouterr().out)["reference"]
+    windows = figures["windows"]
+    assert set(windows) == {
+        "window_m", "count", "left_out", "mean_rmse_m", "max_rmse_m", "scale_min", "scale_max", "scale_ratio",
+        "log_scale_std",
+    }  # fmt: skip
+    assert windows["window_m"] == 40.0
+    assert windows["count"] > 300
+    assert windows["mean_rmse_m"] == pytest.approx(0.1 * np.sqrt(3.0), rel=0.1)
+    assert 0.97 < windows["scale_min"] < 0.99 < windows["scale_max"] < 1.01
+    assert windows["scale_ratio"] == pytest.approx(windows["scale_max"] / windows["scale_min"])
+    assert figures["intervals"]["segments"] == 8
+    for group in ("position_m", "horizontal_m"):
+        for name in ("mean", "median", "rmse", "p95"):
+            low, high = figures["intervals"][group][name]
+            assert low < figures[group][name] < high
+    assert run("drifting.tum", "long.tum") == 0
+    out = capsys.readouterr().out
+    assert "95 % intervals, bootstrapped over 8 segments of 50.1 m:" in out
+    assert "3-D (m): mean " in out
+    assert "windows of 50 m, each with a Sim(3) of its own: " in out
+
+
+@pytest.mark.usefixtures("long_files")
+def test_another_trajectory_is_judged_likewise(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("long.tum", "long.tum", "--compare", "drifting.tum", "--align", "sim3", "--json") == 0
+    figures = json.loads(capsys.readouterr().out)
+    assert set(figures) == {"reference", "compare"}
+    assert figures["reference"]["position_m"]["max"] < 1e-5
+    assert 0.1 < figures["compare"]["position_m"]["mean"] < 0.25
+    assert figures["compare"]["scale"] == pytest.approx(1.0 / 1.01, abs=1e-3)
+    assert run("long.tum", "long.tum", "--compare", "drifting.tum", "--plot", "both.pdf") == 0
+    assert "of the compared trajectory against the reference" in capsys.readouterr().out
+
+
+def test_covariances_are_judged_against_reference_and_map(
+    long_files: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    count = 470
+    claims = np.tile(np.diag([1e-4, 1e-4, 1e-4, 0.01, 0.01, 0.01]), (count, 1, 1))
+    write_covariances(long_files / "long.csv", PoseCovariances(straight_drive(count=count).stamps_ns, claims))
+    noise = np.random.default_rng(1).normal(0.0, 0.1, (count, 3))
+    write_trajectory(long_files / "noisy.tum", shifted(straight_drive(count=count), noise))
+    judged = ["noisy.tum", "long.tum", "--against-map", "long.tum", "--covariances", "long.csv"]
+    assert run(*judged, "--json") == 0
+    figures = json.loads(capsys.readouterr().out)
+    for entry in figures.values():
+        nees = entry["nees"]
+        assert nees["count"] == count
+        assert nees["position"]["mean"] == pytest.approx(3.0, abs=0.3)
+        assert nees["position"]["inside_95"] == pytest.approx(0.95, abs=0.03)
+        low, high = entry["intervals"]["nees"]["position_mean"]
+        assert low < 3.0 < high
+    assert run(*judged) == 0
+    assert (
+        f"NEES of their positions: mean {nees['position']['mean']:.3f} (consistent: 3;" in capsys.readouterr().out
+    )
+
+
 def test_a_failed_judgement_leaves_no_picture(files: Path) -> None:
     assert run("estimate.tum", "other_zone.tum", "--plot", "out.png") == 2
     assert not (files / "out.png").exists()
@@ -155,6 +273,16 @@ def test_a_failed_judgement_leaves_no_picture(files: Path) -> None:
         (["estimate.tum", "--against-map", "reference.tum", "--align", "sim3"], "REFERENCE.tum"),
         (["estimate.tum", "--against-map", "reference.tum", "--spline-through", "a.mcap"], "REFERENCE.tum"),
         (["estimate.tum", "reference.tum", "--spline-through", "absent.mcap"], "absent.mcap"),
+        (["estimate.tum", "--against-map", "reference.tum", "--compare", "second.tum"], "--compare needs"),
+        (["estimate.tum", "reference.tum", "--compare", "other_zone.tum"], "EPSG:32633"),
+        (["estimate.tum", "reference.tum", "--antenna-offset", "0,0,1"], "--antenna-offset needs"),
+        (["estimate.tum", "reference.tum", "--gnss-topic", "/fix"], "--gnss-topic needs"),
+        (["estimate.tum", "reference.tum", "--landmarks", "my_map"], "--landmarks needs"),
+        (["estimate.tum", "reference.tum", "--landmarks", "my_map", "--plot", "out.png"], "my_map"),
+        (["estimate.tum", "reference.tum", "--window-m", "0"], "--window-m"),
+        (["estimate.tum", "reference.tum", "--window-m", "nan"], "makes no sense"),
+        (["estimate.tum", "reference.tum", "--covariances", "absent.csv"], "absent.csv"),
+        (["estimate.tum", "reference.tum", "--covariances", "estimate.tum"], "first line"),
     ],
 )
 def test_bad_usage_and_bad_input_end_with_exit_code_2(

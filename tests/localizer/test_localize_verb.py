@@ -13,8 +13,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fleetmap.covariances import read_covariances
 from fleetmap.drive import GnssFix
 from fleetmap.drives.ros2_writer import DriveWriter
+from fleetmap.evaluation import evaluate_consistency, evaluate_trajectory
 from fleetmap.geodesy import UtmGrid
 from fleetmap.map_package import open_package
 from fleetmap.trajectory import read_trajectory
@@ -88,6 +90,26 @@ def test_a_folder_is_enough(fleetmap: Run, second, mapped_street, second_drive, 
         assert line in out
     assert "median inliers:" in out
     assert_good(tmp_path / "second.tum", second_drive)
+
+
+def test_covariances_are_written_beside_the_poses(
+    fleetmap: Run, second, mapped_street, second_drive, tmp_path
+) -> None:
+    poses, claims = tmp_path / "second.tum", tmp_path / "second.csv"
+    code, out, err = fleetmap(
+        "localize", second, "--map", mapped_street.package, "--trajectory", poses, "--covariances", claims
+    )
+    assert (code, err) == (0, "")
+    assert f"covariances:    {claims}" in out
+    covariances = read_covariances(claims)
+    np.testing.assert_array_equal(covariances.stamps_ns // 1000, read_trajectory(poses).stamps_ns // 1000)
+    consistency = evaluate_consistency(
+        evaluate_trajectory(read_trajectory(poses), second_drive.truth), covariances
+    )
+    assert consistency is not None
+    assert len(consistency.rows) == 10
+    # Not 6: the covariance does not hold the error of the map itself. With axes or units confused it is thousands.
+    assert 0.5 < consistency.pose.mean < 100.0
 
 
 @pytest.mark.parametrize("how", ["only map", "map id", "near", "use gnss"])
