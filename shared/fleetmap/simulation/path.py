@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,16 @@ _STEP_M = 0.25
 _BEND_RADIUS_M = 27.0
 _RAMP = 0.25  # share of a bend in which its curvature grows, and again shrinks
 _BLEND_M = 3.0  # level stretch kept before and after each bend
+
+
+class Line(Protocol):
+    """A line along the ground that things stand beside."""
+
+    def at(self, s_m: Array | float, left_m: Array | float = 0.0, above_m: Array | float = 0.0) -> Array:
+        """Map points (..., 3) beside the line, above the ground."""
+
+    def heading_rad(self, s_m: Array | float) -> Array:
+        """Its direction, counter-clockwise from grid east."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +75,7 @@ def build_path(rng: np.random.Generator, length_m: float, before_m: float, after
         bends.append((0.22 * length_m + 50.0 + 25.0, 30.0, -side))
     curvature = np.zeros_like(s)
     for start, length, turn in bends:
-        curvature += turn / _BEND_RADIUS_M * _trapezoid((s - start) / length)
+        curvature += turn / _BEND_RADIUS_M * trapezoid((s - start) / length)
     heading = float(rng.uniform(-np.pi, np.pi)) + np.cumsum(curvature) * _STEP_M
     steps = np.stack([np.cos(heading), np.sin(heading)], axis=1) * _STEP_M
     east_north = np.cumsum(steps, axis=0) - steps[0]
@@ -73,7 +84,8 @@ def build_path(rng: np.random.Generator, length_m: float, before_m: float, after
     return StreetPath(s, np.column_stack([east_north, heights]), heading)
 
 
-def _trapezoid(x: Array) -> Array:
+def trapezoid(x: Array) -> Array:
+    """Curvature over a bend, from 0 to 1 of its length: grows smoothly, stays, shrinks smoothly."""
     ramp = np.clip(np.minimum(x, 1.0 - x) / _RAMP, 0.0, 1.0)
     return np.asarray(ramp * ramp * (3.0 - 2.0 * ramp))
 

@@ -17,8 +17,8 @@ from fleetmap.errors import InputError
 from fleetmap.geodesy import UtmAnchor, UtmGrid
 from fleetmap.simulation import furniture, houses, textures
 from fleetmap.simulation.atlas import Atlas, build_atlas
+from fleetmap.simulation.horizon import raise_horizon
 from fleetmap.simulation.path import StreetPath, build_path
-from fleetmap.simulation.shading import SKY_GREY
 from fleetmap.simulation.surfaces import SurfaceBuilder, Surfaces
 
 Array = NDArray[np.float64]
@@ -68,13 +68,24 @@ def build_street(
     houses.build_behind(house_rng, builder, path, span)
     for kerb, side in ((_RIGHT_KERB_M, -1.0), (_LEFT_KERB_M, 1.0)):
         furniture.park_cars(furniture_rng, builder, path, kerb - side * 1.05, span)
-        furniture.plant_trees(furniture_rng, builder, path, kerb + side * 1.2, span)
-        furniture.place_furniture(furniture_rng, builder, path, kerb + side * 0.45, span)
+        trees = furniture.paint_trees(furniture_rng, builder)
+        furniture.plant_trees(furniture_rng, builder, trees, path, kerb + side * 1.2, span)
+        paint = furniture.paint_furniture(furniture_rng, builder)
+        furniture.place_furniture(furniture_rng, builder, paint, path, kerb + side * 0.45, span)
     _raise_horizon(far_rng, builder, path)
+    anchor = anchor_at(lat_deg, lon_deg, height_m)
+    return Street(anchor, length_m, path, builder.surfaces(), build_atlas(builder.textures))
+
+
+def anchor_at(lat_deg: float, lon_deg: float, height_m: float) -> UtmAnchor:
+    """The anchor of a world at a site (ellipsoidal height), in the site's UTM zone.
+
+    Raises:
+        InputError: a site outside UTM.
+    """
     utm = UtmGrid.at(lat_deg, lon_deg)
     easting, northing, _ = utm.from_geodetic(np.array(lat_deg), np.array(lon_deg), np.array(height_m))
-    anchor = UtmAnchor(utm.epsg, round(float(easting)), round(float(northing)), round(height_m))
-    return Street(anchor, length_m, path, builder.surfaces(), build_atlas(builder.textures))
+    return UtmAnchor(utm.epsg, round(float(easting)), round(float(northing)), round(height_m))
 
 
 def _sun(rng: Rng) -> Array:
@@ -131,11 +142,4 @@ def _raise_horizon(rng: Rng, builder: SurfaceBuilder, path: StreetPath) -> None:
     for i in range(count):
         for j in range(count):
             builder.add_quad(corner + square + [tile * i, tile * j, 0.0], grass)
-    sides = 16
-    angles = np.linspace(0.0, 2.0 * np.pi, sides + 1)
-    ring = centre + radius * np.stack([np.cos(angles), np.sin(angles), 0.0 * angles], axis=1)
-    width, height = 2.0 * radius * np.sin(np.pi / sides), 80.0
-    for far, near in itertools.pairwise(ring):  # seen from inside, counter-clockwise is leftwards
-        picture = builder.add_texture(textures.paint_horizon(rng, width, height, SKY_GREY))
-        foot, top = [0.0, 0.0, -5.0], [0.0, 0.0, height - 5.0]
-        builder.add_quad(np.stack([near + top, far + top, far + foot, near + foot]), picture, lit=False)
+    raise_horizon(rng, builder, centre, radius)

@@ -63,9 +63,40 @@ class Surfaces:
         weights[:, 2, 0], weights[:, 2, 1] = along[:, 0] - 1.0, along[:, 1] - 1.0
         return weights
 
+    def posed(self, rotations: Array, translations_m: Array, brightness: Array) -> Surfaces:
+        """Each surface turned by its (Q, 3, 3) and moved by its (Q, 3), in a new light (Q,).
+
+        Turning and moving leave :attr:`weights` as they are, so that the matrices need no second solution.
+        """
+        corners = self.corners_in_map @ rotations.transpose(0, 2, 1) + translations_m[:, None]
+        moved = Surfaces(corners, self.texture_indices, brightness, self.two_sided)
+        texture = rotations @ self.map_from_texture + translations_m[:, :, None] * self.weights[:, 2:3]
+        return moved._with_matrices(texture, self.weights)
+
+    def joined(self, other: Surfaces) -> Surfaces:
+        """These surfaces and then the others; nothing is solved again."""
+        both = Surfaces(
+            np.concatenate([self.corners_in_map, other.corners_in_map]),
+            np.concatenate([self.texture_indices, other.texture_indices]),
+            np.concatenate([self.brightness, other.brightness]),
+            np.concatenate([self.two_sided, other.two_sided]),
+        )
+        texture = np.concatenate([self.map_from_texture, other.map_from_texture])
+        return both._with_matrices(texture, np.concatenate([self.weights, other.weights]))
+
+    def _with_matrices(self, map_from_texture: Array, weights: Array) -> Surfaces:
+        self.__dict__.update(map_from_texture=map_from_texture, weights=weights)  # where the cached ones live
+        return self
+
     def _axes(self) -> tuple[Array, Array, Array]:
         top_left = self.corners_in_map[:, 0]
         return top_left, self.corners_in_map[:, 1] - top_left, self.corners_in_map[:, 3] - top_left
+
+
+def brightness_in(sun_in_map: Array, normals_in_map: Array, two_sided: NDArray[np.bool_]) -> Array:
+    """Light (Q,) of the sky and of the sun, whose direction is a unit vector (3,), on surfaces' normals (Q, 3)."""
+    sun = normals_in_map @ sun_in_map
+    return np.asarray(0.42 + 0.9 * np.maximum(np.where(two_sided, np.abs(sun), sun), 0.0))
 
 
 @dataclass
@@ -76,7 +107,8 @@ class SurfaceBuilder:
     textures: list[Texture] = field(default_factory=list)
     _corners: list[Array] = field(default_factory=list)
     _texture_indices: list[int] = field(default_factory=list)
-    _brightness: list[float] = field(default_factory=list)
+    _shade: list[float] = field(default_factory=list)
+    _lit: list[bool] = field(default_factory=list)
     _two_sided: list[bool] = field(default_factory=list)
 
     def add_texture(self, grey: GreyImage, opacity: GreyImage | None = None) -> int:
@@ -90,16 +122,10 @@ class SurfaceBuilder:
         self, corners_in_map: Array, texture: int, *, two_sided: bool = False, lit: bool = True, shade: float = 1.0
     ) -> None:
         """Add a flat surface; corners (4, 3) clockwise from top left, as seen from its front."""
-        corners = np.asarray(corners_in_map, dtype=np.float64)
-        normal = np.cross(corners[3] - corners[0], corners[1] - corners[0])
-        normal /= np.linalg.norm(normal)
-        if abs(float((corners[2] - corners[0]) @ normal)) > _PLANARITY_M:
-            raise ValueError(f"the four corners of a surface do not lie in one plane: {corners.tolist()}")
-        sun = float(normal @ self.sun_in_map)
-        brightness = shade * (0.42 + 0.9 * max(abs(sun) if two_sided else sun, 0.0)) if lit else shade
-        self._corners.append(corners)
+        self._corners.append(np.asarray(corners_in_map, dtype=np.float64))
         self._texture_indices.append(texture)
-        self._brightness.append(brightness)
+        self._shade.append(shade)
+        self._lit.append(lit)
         self._two_sided.append(two_sided)
 
     def add_prism(
@@ -122,13 +148,25 @@ class SurfaceBuilder:
         self.add_prism(base, raised(base, size_m[2]), (texture, texture, texture, texture), texture)
 
     def surfaces(self) -> Surfaces:
-        """All surfaces added so far."""
-        return Surfaces(
-            np.stack(self._corners),
-            np.array(self._texture_indices, dtype=np.int64),
-            np.array(self._brightness),
-            np.array(self._two_sided),
-        )
+        """All surfaces added so far, in the light of the sun.
+
+        Raises:
+            ValueError: the corners of one do not lie in one plane.
+        """
+        corners, two_sided, shade = np.stack(self._corners), np.array(self._two_sided), np.array(self._shade)
+        normals = normals_of(corners)
+        warp = np.abs(np.einsum("qi,qi->q", corners[:, 2] - corners[:, 0], normals))
+        if not warp.max() <= _PLANARITY_M:
+            crooked = corners[int(np.argmax(warp))].tolist()
+            raise ValueError(f"the four corners of a surface do not lie in one plane: {crooked}")
+        light = np.where(self._lit, brightness_in(self.sun_in_map, normals, two_sided), 1.0)
+        return Surfaces(corners, np.array(self._texture_indices, dtype=np.int64), shade * light, two_sided)
+
+
+def normals_of(corners: Array) -> Array:
+    """Unit normals (Q, 3) out of the fronts of surfaces with corners (Q, 4, 3)."""
+    normals = np.cross(corners[:, 3] - corners[:, 0], corners[:, 1] - corners[:, 0])
+    return np.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True))
 
 
 def raised(points: Array, height_m: float) -> Array:

@@ -45,6 +45,18 @@ def paint_road(rng: Rng, length_m: float, width_m: float, lane_lines_m: list[flo
     return road.finish()
 
 
+def paint_crossing(rng: Rng, length_m: float, width_m: float) -> GreyImage:
+    """Where people cross: asphalt with the bars of a zebra, worn, or with none."""
+    bars: list[float] = [] if rng.random() < 0.4 else np.arange(0.6, width_m - 0.5, 1.0).tolist()
+    road = Canvas(rng, width_m, length_m, 40.0, float(rng.uniform(108.0, 122.0)))
+    road.grain(9.0, 4.0, 0.8)
+    for x in bars:
+        patch = road.patch(x, 0.1, x + 0.5, length_m - 0.1)
+        worn = fractal_noise(rng, (patch.shape[0], patch.shape[1]), 16.0) > 1.0
+        patch[~worn] = 195.0
+    return road.finish()
+
+
 def _cast_shadows(sheet: Canvas) -> None:
     """Shadows of houses (straight edges) and of trees (speckled)."""
     rng = sheet.rng
@@ -108,6 +120,20 @@ def paint_facade(rng: Rng, width_m: float, height_m: float) -> GreyImage:
     if rng.random() < 0.5:
         _paint_shop(wall)
     _paint_clutter(wall)
+    return wall.finish()
+
+
+def paint_alike(shared: Rng, own: Rng, width_m: float, height_m: float) -> GreyImage:
+    """A front whose wall and windows come from ``shared``, and a few details from ``own``."""
+    front = paint_facade(shared, width_m, height_m)
+    wall = Canvas(own, width_m, height_m, WALL_PX_PER_M, 0.0)
+    wall.grey = front.astype(np.float32)
+    for _ in range(2):
+        x, y = own.uniform(0.5, width_m - 1.0), own.uniform(0.5, height_m - 0.8)
+        wall.rectangle(
+            x, y, x + own.uniform(0.15, 0.5), y + own.uniform(0.15, 0.4), float(own.uniform(20, 240)), 8.0
+        )
+    wall.text(own.uniform(0.5, width_m - 1.5), height_m - 1.6, 0.22, 40.0, 3)
     return wall.finish()
 
 
@@ -267,8 +293,8 @@ def paint_sign(rng: Rng, width_m: float, height_m: float) -> GreyImage:
 
 
 def paint_horizon(rng: Rng, width_m: float, height_m: float, sky_grey: float) -> GreyImage:
-    """Far roofs, trees and hills below the sky; the top row is sky."""
-    scene = Canvas(rng, width_m, height_m, 5.0, sky_grey)
+    """Far roofs, trees and hills below the sky; the top row is sky. 400 rows, however far and high they are."""
+    scene = Canvas(rng, width_m, height_m, 400.0 / height_m, sky_grey)
     rows, columns = scene.grey.shape
     x = np.arange(columns)
     for layer, (top, grey) in enumerate(((0.32, 190.0), (0.25, 160.0), (0.19, 115.0))):

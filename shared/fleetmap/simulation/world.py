@@ -1,7 +1,12 @@
-"""A world to drive through: what stands still, what moves, and where everything truly is."""
+"""A world to drive through: what stands still, what moves, and where everything truly is.
+
+A seed fixes roads, houses, trees, hills and markers; a drive's own seed the cars that park and move on its day,
+and where the sun stands.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -10,24 +15,33 @@ from numpy.typing import NDArray
 
 from fleetmap.errors import InputError
 from fleetmap.geodesy import UtmAnchor
-from fleetmap.geometry import Pose
-from fleetmap.simulation.atlas import Atlas
-from fleetmap.simulation.street import build_street
-from fleetmap.simulation.surfaces import Surfaces
+from fleetmap.simulation import traffic
+from fleetmap.simulation.atlas import Atlas, build_atlas
+from fleetmap.simulation.blocks import SHORTEST_CIRCUIT_M, Kerb, build_blocks, plan_circuit
+from fleetmap.simulation.ground import StreetGrid, lay_far_ground
+from fleetmap.simulation.horizon import raise_horizon
+from fleetmap.simulation.markers import Marker, set_up_markers
+from fleetmap.simulation.palette import Palette
+from fleetmap.simulation.path import Line
+from fleetmap.simulation.relief import Terrain, shape_profile
+from fleetmap.simulation.roads import RoadPath, closed_path
+from fleetmap.simulation.street import anchor_at, build_street
+from fleetmap.simulation.surfaces import SurfaceBuilder, Surfaces
+from fleetmap.simulation.traffic import Traffic
 
 Array = NDArray[np.float64]
+Rng = np.random.Generator
 
 WORLD_KINDS = ("city", "straight", "tunnel", "open", "facades", "street")
+LONGEST_M = 3200.0
+_HORIZON_M = 150.0  # from the path to the ring of hills, at least
 
 
-class Path(Protocol):
-    """The centre of the right-hand lane. A closed path takes any ``s_m``: one lap after the other."""
+class Path(Line, Protocol):
+    """The centre of the right-hand lane. A closed path takes any ``s_m``: one lap after the other.
 
-    def at(self, s_m: Array | float, left_m: Array | float = 0.0, above_m: Array | float = 0.0) -> Array:
-        """Map points (..., 3) beside the path, above the ground."""
-
-    def heading_rad(self, s_m: Array | float) -> Array:
-        """Direction of travel, counter-clockwise from grid east; it goes on growing from lap to lap."""
+    Its heading goes on growing from lap to lap.
+    """
 
     def up(self, s_m: Array | float) -> Array:
         """Unit normals (..., 3) of the road."""
@@ -42,16 +56,6 @@ class Scene:
 
 
 @dataclass(frozen=True)
-class Marker:
-    """A square ArUco marker on a wall or a board."""
-
-    number: int  # its id in the dictionary
-    dictionary: str  # such as "DICT_5X5_100": the name in cv2.aruco
-    side_m: float  # outer edge of the black square
-    map_from_marker: Pose  # origin in the middle, x right, y up as one looks at it, z out of the wall
-
-
-@dataclass(frozen=True)
 class World:
     """A world for one drive, in the map frame of ``anchor``: grid east, grid north, height in metres."""
 
@@ -62,13 +66,36 @@ class World:
     scene: Scene  # what stands still
     markers: tuple[Marker, ...] = ()
     tunnels_m: tuple[tuple[float, float], ...] = ()  # stretches (start, end) along the path without sky
+    traffic: Traffic | None = None
+
+    @property
+    def surfaces(self) -> Surfaces:
+        """What stands still."""
+        return self.scene.surfaces
+
+    @property
+    def atlas(self) -> Atlas:
+        """The textures of all that stands or moves."""
+        return self.scene.atlas
 
     def scene_at(self, seconds: float) -> Scene:
         """The scene with the moving cars where they are ``seconds`` after the start of the drive.
 
         Their surfaces follow those of ``scene``: numbers from ``len(scene.surfaces)`` on move.
         """
-        return self.scene
+        if self.traffic is None:
+            return self.scene
+        return Scene(self.scene.surfaces.joined(self.traffic.surfaces_at(seconds)), self.scene.atlas)
+
+
+@dataclass(frozen=True)
+class Plot:
+    """What a kind of world lays out before cars, markers and the horizon come to it."""
+
+    path: RoadPath
+    kerbs: list[Kerb]
+    marker_places: list[tuple[float, float]]  # (s, left) along the path
+    tunnels_m: tuple[tuple[float, float], ...] = ()
 
 
 def build_world(
@@ -78,7 +105,7 @@ def build_world(
     length_m: float = 300.0,
     drive_seed: int = 0,
     parked_cars_changed: float = 0.3,
-    moving_cars_per_km: float = 0.0,
+    moving_cars_per_km: float = 8.0,
     own_lane_m: float = 0.0,
     own_speed_mps: float = 8.0,
     sun_deg: tuple[float, float] | None = None,
@@ -88,10 +115,108 @@ def build_world(
 ) -> World:
     """Build the world of a seed, as one drive finds it. Equal arguments give equal worlds.
 
+    Args:
+        seed: of all that stays the same from drive to drive.
+        kind: "city": a circuit around blocks; "straight": a road out of town; "tunnel": a road through a hill;
+            "open": a circuit on a wide place; "facades": a circuit among houses that look alike; "street": one
+            bend, no traffic.
+        length_m: of the path; of one lap on a circuit.
+        drive_seed: of parked cars, moving cars and the sun.
+        parked_cars_changed: share of the parked cars that differ between any two drive seeds.
+        moving_cars_per_km: oncoming cars; if any, one more drives ahead (a van 6 m ahead from 60 per km on).
+        own_lane_m: the recording vehicle's lane, as an offset to the left: oncoming cars keep to the other one.
+        own_speed_mps: the recording vehicle's speed, which the car ahead keeps, from s = 0 at 0 seconds.
+        sun_deg: azimuth from north by east, and elevation; by default the drive's seed chooses.
+        lat_deg, lon_deg, height_m: the site (ellipsoidal height).
+
     Raises:
-        InputError: no such kind of world, or a length that cannot be built.
+        InputError: no such kind of world, a length that cannot be built, or a site outside UTM.
     """
     if kind not in WORLD_KINDS:
         raise InputError(f"there is no world of kind {kind!r}; choose from {', '.join(WORLD_KINDS)}")
-    street = build_street(seed, length_m, lat_deg=lat_deg, lon_deg=lon_deg, height_m=height_m)
-    return World(street.anchor, street.path, street.length_m, False, Scene(street.surfaces, street.atlas))
+    if kind == "street":
+        street = build_street(seed, length_m, lat_deg=lat_deg, lon_deg=lon_deg, height_m=height_m)
+        return World(street.anchor, street.path, street.length_m, False, Scene(street.surfaces, street.atlas))
+    if not SHORTEST_CIRCUIT_M <= length_m <= LONGEST_M:
+        raise InputError(
+            f"a world of {length_m} m cannot be built; give {SHORTEST_CIRCUIT_M:.0f} to {LONGEST_M:.0f} m"
+        )
+    anchor = anchor_at(lat_deg, lon_deg, height_m)
+    plan_rng, far_rng = np.random.default_rng(seed).spawn(2)
+    drive_rng = np.random.default_rng([seed, drive_seed])
+    builder = SurfaceBuilder(_towards_sun(drive_rng, sun_deg))
+    palette = Palette(seed, builder)
+    plot = _LAYOUTS[kind](plan_rng, builder, palette, length_m)
+    markers = set_up_markers(builder, palette, plot.path, plot.marker_places)
+    lay_horizon(far_rng, builder, plot.path)
+    traffic.park_cars(builder, palette, plot.kerbs, seed, drive_seed, parked_cars_changed)
+    moving = traffic.send_traffic(
+        drive_rng,
+        builder,
+        palette,
+        plot.path,
+        (0.0, length_m) if plot.path.is_closed else (-40.0, length_m + 80.0),
+        is_closed=plot.path.is_closed,
+        cars_per_km=moving_cars_per_km,
+        own_lane_m=own_lane_m,
+        own_speed_mps=own_speed_mps,
+    )
+    scene = Scene(builder.surfaces(), build_atlas(builder.textures))
+    path = plot.path
+    return World(anchor, path, path.length_m, path.is_closed, scene, markers, plot.tunnels_m, moving)
+
+
+def _towards_sun(rng: Rng, sun_deg: tuple[float, float] | None) -> Array:
+    """Unit vector (3,) towards the sun, in the map frame."""
+    drawn = float(rng.uniform(0.0, 360.0)), float(rng.uniform(25.0, 60.0))
+    azimuth, elevation = np.radians(drawn if sun_deg is None else sun_deg)
+    across, up = np.cos(elevation), np.sin(elevation)
+    return np.array([np.sin(azimuth) * across, np.cos(azimuth) * across, up])
+
+
+def lay_horizon(rng: Rng, builder: SurfaceBuilder, path: RoadPath) -> None:
+    """Fields and hills around a path, so that no line of sight ends in nothing but the sky."""
+    positions = path.at(np.arange(0.0, path.length_m, 5.0))
+    centre = (positions.min(axis=0) + positions.max(axis=0)) / 2.0
+    radius = float(np.linalg.norm((positions - centre)[:, :2], axis=1).max()) + _HORIZON_M
+    centre[2] = lay_far_ground(rng, builder, path, radius)
+    raise_horizon(rng, builder, centre, radius, pictures=6)
+
+
+def _city(rng: Rng, builder: SurfaceBuilder, palette: Palette, length_m: float, *, alike: bool = False) -> Plot:
+    path, grid = _circuit(rng, length_m)
+    kerbs = build_blocks(rng, builder, palette, path, grid, alike=alike)
+    return Plot(path, kerbs, _along_straights(path, 45.0, (-5.3, 8.8)))
+
+
+def _facades(rng: Rng, builder: SurfaceBuilder, palette: Palette, length_m: float) -> Plot:
+    return _city(rng, builder, palette, length_m, alike=True)
+
+
+def _circuit(rng: Rng, length_m: float) -> tuple[RoadPath, StreetGrid]:
+    grid, corners = plan_circuit(rng, length_m)
+    profiles = [
+        shape_profile(rng, axes[:, None] + np.array([-22.0, 22.0]) * 0.4, 0.04, 0.08, 60.0)
+        for axes in (grid.columns_m, grid.rows_m)
+    ]
+    heading = float(rng.uniform(-np.pi, np.pi))
+    origin = np.zeros(3)
+    path = closed_path(Terrain(heading, origin, profiles[0], profiles[1]), corners)
+    terrain = Terrain(heading, -path.at(0.0), profiles[0], profiles[1])
+    return closed_path(terrain, corners), grid
+
+
+def _along_straights(path: RoadPath, every_m: float, lefts_m: tuple[float, float]) -> list[tuple[float, float]]:
+    """Places (s, left) on alternate sides, where the path is straight."""
+    s = np.arange(14.0, path.length_m - 5.0, every_m)
+    straight = np.abs(path.heading_rad(s + 12.0) - path.heading_rad(s - 12.0)) < 1e-3
+    return [(float(place), lefts_m[i % 2]) for i, place in enumerate(s[straight])]
+
+
+_LAYOUTS: dict[str, Callable[[Rng, SurfaceBuilder, Palette, float], Plot]] = {
+    "city": _city,
+    "facades": _facades,
+    "straight": _city,
+    "tunnel": _city,
+    "open": _city,
+}
