@@ -28,6 +28,7 @@ from fleetmap.trajectory import Trajectory
 Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]
 
+MIN_STEP_NS = 1_000_000  # fixes closer than this are one: a spline would bend wildly between two
 STANDING_MPS = 1.0  # below this a spline's tangent is no direction of travel
 
 
@@ -118,13 +119,15 @@ def compare_with_yardstick(errors: TrajectoryErrors, yardstick: TrajectoryErrors
 class _Fixes:
     """The fixes on the grid, N >= 2."""
 
-    stamps_ns: Stamps  # (N,) strictly increasing; of equal stamps the first fix
+    stamps_ns: Stamps  # (N,) strictly increasing; of fixes within a millisecond the first
     positions_m: Array  # (N, 3) easting, northing, height
     variances_m2: Array  # (N, 3) of them
 
     @staticmethod
     def of(fixes: Sequence[GnssFix], epsg: int) -> _Fixes:
         stamps_ns, first = np.unique(np.array([fix.stamp_ns for fix in fixes], dtype=np.int64), return_index=True)
+        apart = np.diff(stamps_ns, prepend=stamps_ns[:1] - MIN_STEP_NS) >= MIN_STEP_NS
+        stamps_ns, first = stamps_ns[apart], first[apart]
         if len(stamps_ns) < 2:
             raise TrajectoryError(f"a spline needs two GNSS fixes or more, the recording holds {len(stamps_ns)}")
         grid = UtmGrid(epsg)

@@ -160,6 +160,13 @@ def test_a_judgement_holds_an_interval_for_every_figure_it_names() -> None:
     assert figures["coverage"] == [1.0, 1.0]
 
 
+def test_segments_are_never_shorter_than_the_windows() -> None:
+    road_m = np.arange(0.0, 301.0, 1.0)
+    errors = _errors(road_m, np.arange(301), np.full(301, 0.1))
+    assert judge(errors, window_m=20.0).segment_m == 50.0
+    assert judge(errors, window_m=100.0).segment_m == 100.0
+
+
 def test_a_short_drive_is_judged_without_intervals_and_without_windows() -> None:
     road_m = np.arange(0.0, 41.0, 1.0)
     figures = judge(_errors(road_m, np.arange(41), np.full(41, 0.1))).to_json()

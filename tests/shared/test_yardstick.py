@@ -172,6 +172,17 @@ def test_a_vehicle_that_never_moves_has_no_direction_to_take_an_arm_off() -> Non
     assert evaluate_smoothing_spline(fixes, still, np.array([0.0, -1.0, 0.0])).position_m.max < 0.3
 
 
+def test_fixes_reported_twice_a_moment_apart_do_not_bend_the_spline() -> None:
+    truth = winding_drive()
+    once = sample_fixes(truth, RTK, interval_s=1.0, seed=2)
+    again = sample_fixes(truth, RTK, interval_s=1.0, seed=3)
+    twice = once + [
+        GnssFix(fix.stamp_ns + 1, fix.lat_deg, fix.lon_deg, fix.height_m, fix.covariance_enu_m2) for fix in again
+    ]
+    for judge_spline in (evaluate_gnss_spline, evaluate_smoothing_spline):
+        np.testing.assert_array_equal(judge_spline(twice, truth).offsets_m, judge_spline(once, truth).offsets_m)
+
+
 def test_two_fixes_are_joined_by_a_straight_line() -> None:
     errors = evaluate_smoothing_spline(fixes(every(1_000_000_000)[:2]), reference())
     assert errors.position_m.max < 0.3

@@ -122,9 +122,9 @@ def evaluate(
     Sim(3) of its own is fitted; mean and maximum of their RMSE tell the local error, the ratio of the largest to
     the smallest scale tells the drift. A window must fit whole: a drive shorter than one has none.
 
-    Intervals (95 %) are bootstrapped over segments of the road of 50 m or more, as neighbouring errors are
-    alike; a drive of less than two segments has none. Errors alike over longer ways, such as the slow bias of a
-    consumer receiver, they do not see.
+    Intervals (95 %) are bootstrapped over segments of the road of 50 m (or a window, if that is longer) or more,
+    as neighbouring errors are alike; a drive of less than two segments has none. Errors alike over longer ways,
+    such as the slow bias of a consumer receiver, they do not see.
 
     Yardsticks (--spline-through): a cubic spline through the fixes, the antenna taken as the camera; and a
     smoothing spline that weighs the fixes by their covariance, with the lever arm taken off. A map that does not

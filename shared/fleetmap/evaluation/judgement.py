@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from fleetmap.covariances import PoseCovariances
-from fleetmap.evaluation.bootstrap import CONFIDENCE, Interval, SegmentBootstrap
+from fleetmap.evaluation.bootstrap import CONFIDENCE, SEGMENT_M, Interval, SegmentBootstrap
 from fleetmap.evaluation.consistency import Consistency, evaluate_consistency
 from fleetmap.evaluation.trajectory_errors import TrajectoryErrors
 from fleetmap.evaluation.windows import WINDOW_M, WindowErrors, fit_windows
@@ -52,7 +52,7 @@ def judge(
 ) -> Judgement:
     """Windows, consistency and bootstrap intervals of a trajectory's errors.
 
-    A window counts for the segment that holds its middle.
+    Segments are at least as long as a window, and a window counts for the segment that holds its middle.
 
     Raises:
         InputError: a window that is not positive.
@@ -60,7 +60,7 @@ def judge(
     """
     windows = fit_windows(errors, window_m)
     consistency = None if covariances is None else evaluate_consistency(errors, covariances)
-    bootstrap = SegmentBootstrap.along(errors.road_m)
+    bootstrap = SegmentBootstrap.along(errors.road_m, max(SEGMENT_M, window_m))
     segment_of = bootstrap.segment_of[errors.compared]
     intervals: dict[str, Intervals] = {
         "position_m": bootstrap.statistics(errors.distances_m, segment_of),
