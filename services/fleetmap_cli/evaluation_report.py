@@ -82,7 +82,7 @@ def _verdict(errors: TrajectoryErrors, yardstick: TrajectoryErrors) -> Iterator[
     if comparison is None:
         return
     spread = "" if comparison.interval is None else f" (95 %: {_range(comparison.interval, signed=True)})"
-    verdict = "better than GNSS alone" if comparison.better else "NOT better than GNSS alone: owed to no image"
+    verdict = "better than GNSS alone" if comparison.better else "NOT better than GNSS alone, so it proves nothing"
     yield (
         f"  beside smooth, over {comparison.common} poses that both have: mean {comparison.mean_m:.4f} against "
         f"{comparison.yardstick_mean_m:.4f} m, difference {comparison.difference_m:+.4f}{spread}: {verdict}"
