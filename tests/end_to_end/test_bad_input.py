@@ -8,7 +8,7 @@ bad input                       here                      elsewhere
 no GNSS                         map                       tests/mapper/test_mapper
 no calibration                  map                       tests/cli/test_localize, tests/shared/drives
 two cameras and none chosen     map, localize             tests/shared/drives/test_inspection
-an empty or truncated MCAP      map, localize             tests/cli/test_info, tests/shared/drives
+an empty MCAP, or one cut short map, localize             tests/shared/drives/test_damaged_recordings
 images that cannot be decoded   map, localize             tests/shared/drives/test_bad_recordings
 all-black images                map                       tests/cli/test_localize, tests/mapper/test_mapper
 frames out of order             map, localize             tests/shared/drives/test_bad_recordings
@@ -133,8 +133,12 @@ def image_9_late(number: int, topic: str, message: Message) -> list[tuple[str, M
 BAD_RECORDINGS: dict[str, tuple[Callable[[Path, Path], object], tuple[str, ...]]] = {
     "empty": (lambda good, bad: bad.touch(), ("is empty", "record or convert it again")),
     "truncated": (
-        lambda good, bad: bad.write_bytes(good.read_bytes()[:-5000]),
-        ("is truncated", "copy it again"),
+        lambda good, bad: bad.write_bytes(good.read_bytes()[:100]),
+        ("is truncated", "no message in it can be read", "copy it again"),
+    ),
+    "without_whole_images": (
+        lambda good, bad: bad.write_bytes(good.read_bytes()[:6000]),
+        ("holds no ROS 2 images",),
     ),
     "two_cameras": (
         lambda good, bad: rewritten(good, bad, second_camera),

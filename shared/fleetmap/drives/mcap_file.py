@@ -139,10 +139,11 @@ def _losses(index: McapIndex) -> list[str]:
     if index.gaps:
         are_chunks = any(block.is_chunk for block in index.blocks)
         one, many = ("chunk", "chunks") if are_chunks else ("stretch", "stretches")
-        count = f"1 {one}" if len(index.gaps) == 1 else f"{len(index.gaps)} {many}"
+        count = len(index.gaps)
+        what = f"1 {one} cannot be read and is" if count == 1 else f"{count} {many} cannot be read and are"
         places = "; ".join(_place(index, gap) for gap in index.gaps[:_NAMED_GAPS])
         more = "; ..." if len(index.gaps) > _NAMED_GAPS else ""
-        losses.append(f"is damaged: {count} cannot be read and left out ({places}{more})")
+        losses.append(f"is damaged: {what} left out ({places}{more})")
     elif index.is_doubtful:
         losses.append("is damaged: its checksum does not fit, and some of its messages may be wrong")
     if index.unfinished_bytes is not None:

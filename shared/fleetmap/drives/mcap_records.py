@@ -82,9 +82,10 @@ def definition(opcode: int, content: Bytes) -> Schema | Channel:
     """The schema or channel of a record's content. Raises DamagedRecordError if it is none."""
     stream = ReadDataStream(BytesIO(bytes(content)))
     try:
-        return Schema.read(stream) if opcode == Opcode.SCHEMA else Channel.read(stream)
+        found: Schema | Channel = Schema.read(stream) if opcode == Opcode.SCHEMA else Channel.read(stream)
     except Exception as error:  # a parser fed with damaged bytes
         raise DamagedRecordError(f"a definition cannot be read ({type(error).__name__})") from error
+    return found
 
 
 def chunk_header(content: Bytes, length: int) -> ChunkHeader:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import re
 import zlib
 from collections import Counter
+from dataclasses import replace
 from typing import IO
 
 from mcap.opcode import Opcode
@@ -121,7 +122,7 @@ class _Scan:
             spans = message_spans(data)
             found = definitions_in(data)
         except DamagedRecordError as error:
-            self._index.gaps.append(Gap(offset, begin + length, header.start_ns, header.end_ns, str(error)))
+            self._add_gap(Gap(offset, begin + length, header.start_ns, header.end_ns, str(error)))
             self._doubtful += definitions_in(legible_chunk_data(header, content))
         else:
             for each in found:
@@ -151,7 +152,7 @@ class _Scan:
             self._index.unfinished_bytes = self._size - (offset if is_cut else begin)
             return None
         self._close_run()
-        self._index.gaps.append(Gap(begin, found, None, None, reason))
+        self._add_gap(Gap(begin, found, None, None, reason))
         return found
 
     def _next_record(self, begin: int) -> int | None:
@@ -200,6 +201,14 @@ class _Scan:
         self._index.blocks.append(
             Block(begin, end - begin, min(times_ns), max(times_ns), ids, is_chunk=is_chunk, is_cut=is_cut)
         )
+
+    def _add_gap(self, gap: Gap) -> None:
+        """Nothing readable between two gaps makes them one, unless both are chunks of their own."""
+        gaps = self._index.gaps
+        if gaps and gap.begin <= gaps[-1].end and gap.start_ns is None:
+            gaps[-1] = replace(gaps[-1], end=gap.end)
+        else:
+            gaps.append(gap)
 
     def _define(self, found: Schema | Channel) -> None:
         if isinstance(found, Schema):

@@ -40,23 +40,16 @@ def test_a_file_that_is_no_mcap(tmp_path):
     assert "not an MCAP" in refusal_of(tmp_path / "notes.mcap")
 
 
-@pytest.mark.parametrize("kept", [0.999, 0.9, 0.5, 0.1, 0.002])
-def test_a_truncated_recording_is_refused_and_no_part_of_it_is_used(street, kept):
+@pytest.mark.parametrize("kept", [0.1, 0.002])
+def test_a_recording_truncated_before_its_first_message(street, kept):
     path = street()
     data = path.read_bytes()
     path.write_bytes(data[: int(len(data) * kept)])
-    assert "is truncated" in refusal_of(path)
+    assert "is truncated: no message in it can be read" in refusal_of(path)
 
 
-def test_a_recording_cut_in_the_middle_but_with_both_ends_is_damaged(street):
-    path = street()
-    data = path.read_bytes()
-    path.write_bytes(data[: len(data) // 2] + data[-8:])
-    assert "is damaged" in refusal_of(path)
-
-
-def test_flipped_bits_are_found_by_the_checksum(street):
-    path = street(compression=CompressionType.NONE)
+def test_flipped_bits_in_the_only_chunk_are_found_by_the_checksum(street):
+    path = street(compression=CompressionType.NONE, chunk_size=1_000_000)
     data = bytearray(path.read_bytes())
     data[len(data) // 3] ^= 0xFF
     path.write_bytes(bytes(data))
@@ -108,8 +101,8 @@ def test_an_image_that_cannot_be_decoded_is_named(record, small_camera, pictures
 def test_a_raw_image_of_an_unknown_encoding_is_named(record, small_camera):
     with record() as recorder:
         recorder.camera_info("/x/camera_info", T0_NS, small_camera, "cam")
-        recorder.raw_image("/x/image", T0_NS, np.zeros(48 * 128, np.uint8), "mono16", "cam", width=64, step=128)
-    assert "encoding 'mono16'" in refusal_of(recorder.path)
+        recorder.raw_image("/x/image", T0_NS, np.zeros(48 * 512, np.uint8), "64FC1", "cam", width=64, step=512)
+    assert "encoding '64FC1'" in refusal_of(recorder.path)
 
 
 def test_a_raw_image_shorter_than_its_size_is_named(record, small_camera):
