@@ -1,4 +1,7 @@
-"""The door for rosbags: ROS 2 messages from and to CDR bytes, with the definitions a recording brings along."""
+"""The door for rosbags: ROS messages from and to bytes, with the definitions a recording brings along.
+
+ROS 2 messages are in CDR. What ``mcap convert`` makes of a ROS 1 bag keeps ROS 1's own encoding; it is read too.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +19,9 @@ IMAGE = "sensor_msgs/msg/Image"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 NAV_SAT_FIX = "sensor_msgs/msg/NavSatFix"
 TF_MESSAGE = "tf2_msgs/msg/TFMessage"
+IMU = "sensor_msgs/msg/Imu"
+ODOMETRY = "nav_msgs/msg/Odometry"
+TWIST_STAMPED = "geometry_msgs/msg/TwistStamped"
 
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _IDL_RULER = "=" * 80 + "\n"
@@ -26,6 +32,8 @@ class MessageDecoder:
 
     def __init__(self, topic: Topic) -> None:
         self._topic = topic
+        self._message_type = ros2_name(topic.message_type)
+        self._is_ros1 = topic.message_encoding == "ros1"
         self._typestore = _typestore_of(topic)
 
     def decode(self, data: bytes, log_time_ns: int) -> Any:
@@ -40,12 +48,20 @@ class MessageDecoder:
                 " 'ros2 bag convert' (compression of whole chunks is fine)"
             )
         try:
-            return self._typestore.deserialize_cdr(data, self._topic.message_type)
+            if self._is_ros1:
+                return self._typestore.deserialize_ros1(data, self._message_type)
+            return self._typestore.deserialize_cdr(data, self._message_type)
         except Exception as error:  # generated code: damaged bytes can raise anything
             raise DriveError(
                 f"a message of {self._topic.name} (log time {log_time_ns} ns) is no"
-                f" {self._topic.message_type} in CDR: {error}"
+                f" {self._topic.message_type} in {'ROS 1 encoding' if self._is_ros1 else 'CDR'}: {error}"
             ) from error
+
+
+def ros2_name(message_type: str) -> str:
+    """ROS 1 calls a type ``sensor_msgs/Image`` that ROS 2 calls ``sensor_msgs/msg/Image``."""
+    package, _, name = message_type.partition("/")
+    return message_type if "/" in name or not name else f"{package}/msg/{name}"
 
 
 def stamp_ns_of(header: Any) -> int:
@@ -78,15 +94,16 @@ def encode(message: Any) -> bytes:
 def _typestore_of(topic: Topic) -> Typestore:
     """One store per topic: two recorders' definitions of one type may differ within one file."""
     if not topic.schema_text.strip():
-        return standard_typestore()
+        return get_typestore(Stores.ROS1_NOETIC) if topic.message_encoding == "ros1" else standard_typestore()
+    message_type = ros2_name(topic.message_type)
     typestore = get_typestore(Stores.EMPTY)
     try:
         if topic.schema_encoding == "ros2idl":
             for document in _idl_documents(topic.schema_text):
                 typestore.register(get_types_from_idl(document))
         else:
-            typestore.register(get_types_from_msg(topic.schema_text, topic.message_type))
-        typestore.get_msgdef(topic.message_type)
+            typestore.register(get_types_from_msg(topic.schema_text, message_type))
+        typestore.get_msgdef(message_type)
     except Exception as error:  # a parser fed with foreign text
         raise DriveError(
             f"the message definition of {topic.name} ({topic.message_type}) cannot be understood:"

@@ -1,88 +1,143 @@
-"""ROS 2 messages as this project's values: cameras, fixes and static transforms."""
+"""ROS messages as this project's values.
+
+Sources: the definitions of sensor_msgs, nav_msgs, geometry_msgs and tf2_msgs in ROS 2 Humble. ROS 1 has the same
+messages; where its field names differ they are capital letters.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
-from fleetmap.camera import Camera
-from fleetmap.drive import GnssFix
-from fleetmap.drives.ros2_messages import frame_id_of, stamp_ns_of
-from fleetmap.errors import CalibrationError, DriveError
-from fleetmap.geometry import Array, Pose, rotations_from_quat_xyzw
+from fleetmap.drive import ImuSample, WheelSpeed
+from fleetmap.drives.messages import (
+    CALIBRATIONS,
+    FIXES,
+    IMAGES,
+    INERTIAL,
+    SPEEDS,
+    TRANSFORMS,
+    CalibrationMessage,
+    CompressedPicture,
+    FixMessage,
+    ImageMessage,
+    RawPicture,
+    Reading,
+    Readings,
+    Region,
+    SpeedMessage,
+    TransformMessage,
+)
+from fleetmap.drives.ros2_messages import (
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    IMAGE,
+    IMU,
+    NAV_SAT_FIX,
+    ODOMETRY,
+    TF_MESSAGE,
+    TWIST_STAMPED,
+    frame_id_of,
+    stamp_ns_of,
+)
+from fleetmap.drives.value_checks import fix_of, imu_sample_of, matrix_of, rigid_transform
 
-UNKNOWN_COVARIANCE_SIGMA_M = 1.5  # a fix that does not say how good it is counts as a consumer receiver's
-_NO_FIX, _COVARIANCE_UNKNOWN = -1, 0
-_PLUMB_BOB_LIKE = ("plumb_bob", "rational_polynomial", "")
-_NEVER_PINHOLE = ("equidistant", "fisheye")  # these bend the image also with all coefficients zero
+_NO_FIX, _COVARIANCE_UNKNOWN = -1, 0  # constants of sensor_msgs/NavSatStatus and NavSatFix
+_NOT_MEASURED = -1.0  # first element of a covariance in sensor_msgs/Imu
 
 
-def camera_from_camera_info(info: Any, info_topic: str, *, rectified: bool) -> Camera:
-    """The camera of a CameraInfo; rectified images use P without distortion.
+def _compressed_image(message: Any) -> Iterator[ImageMessage]:
+    picture = CompressedPicture(message.data.tobytes(), str(message.format))
+    yield ImageMessage(stamp_ns_of(message.header), frame_id_of(message.header), picture)
 
-    Raises:
-        CalibrationError: an uncalibrated camera, or a distortion model other than plumb_bob.
-    """
-    width, height = int(info.width), int(info.height)
-    K, P = np.asarray(info.k, dtype=np.float64).reshape(3, 3), np.asarray(info.p, dtype=np.float64).reshape(3, 4)
-    if rectified and P[0, 0] > 0.0:
-        return _camera(info_topic, width, height, P[:, :3], ())
-    model = str(info.distortion_model)
-    coefficients = tuple(float(value) for value in info.d)
-    is_plumb_bob = model in _PLUMB_BOB_LIKE and len(coefficients) >= 4 and not any(coefficients[5:])
-    if model in _NEVER_PINHOLE or (any(coefficients) and not is_plumb_bob):
-        raise CalibrationError(
-            f"{info_topic} has distortion model '{model}' with {len(coefficients)} coefficients;"
-            " fleetmap reads plumb_bob (k1, k2, p1, p2, k3): calibrate with it, or record rectified images"
+
+def _image(message: Any) -> Iterator[ImageMessage]:
+    picture = RawPicture(
+        encoding=str(message.encoding),
+        width_px=int(message.width),
+        height_px=int(message.height),
+        row_bytes=int(message.step),
+        data=np.asarray(message.data, dtype=np.uint8),
+        is_bigendian=bool(message.is_bigendian),
+    )
+    yield ImageMessage(stamp_ns_of(message.header), frame_id_of(message.header), picture)
+
+
+def _camera_info(message: Any) -> Iterator[CalibrationMessage]:
+    roi = message.roi
+    yield CalibrationMessage(
+        frame_id=frame_id_of(message.header),
+        width_px=int(message.width),
+        height_px=int(message.height),
+        distortion_model=str(message.distortion_model),
+        coefficients=tuple(float(value) for value in _letter(message, "d")),
+        K=matrix_of(_letter(message, "k"), 3, 3),
+        P=matrix_of(_letter(message, "p"), 3, 4),
+        binning=(max(int(message.binning_x), 1), max(int(message.binning_y), 1)),  # 0 means the same as 1
+        region=Region(int(roi.x_offset), int(roi.y_offset), int(roi.width), int(roi.height)),
+    )
+
+
+def _nav_sat_fix(message: Any) -> Iterator[FixMessage]:
+    fix = None
+    if int(message.status.status) > _NO_FIX:
+        is_known = int(message.position_covariance_type) != _COVARIANCE_UNKNOWN
+        fix = fix_of(
+            stamp_ns_of(message.header),
+            (float(message.latitude), float(message.longitude), float(message.altitude)),
+            matrix_of(message.position_covariance, 3, 3) if is_known else None,
         )
-    return _camera(info_topic, width, height, K, coefficients if any(coefficients) else ())
+    yield FixMessage(frame_id_of(message.header), fix)
 
 
-def fix_from_nav_sat_fix(message: Any) -> GnssFix | None:
-    """A fix, or None for a message that says there is none or lacks a finite position."""
-    position = (float(message.latitude), float(message.longitude), float(message.altitude))
-    is_on_globe = abs(position[0]) <= 90.0 and abs(position[1]) <= 180.0
-    if int(message.status.status) <= _NO_FIX or not np.all(np.isfinite(position)) or not is_on_globe:
-        return None
-    covariance = np.array(message.position_covariance, dtype=np.float64).reshape(3, 3)
-    if int(message.position_covariance_type) == _COVARIANCE_UNKNOWN or not _is_covariance(covariance):
-        covariance = np.eye(3) * UNKNOWN_COVARIANCE_SIGMA_M**2
-    return GnssFix(stamp_ns_of(message.header), *position, covariance)
-
-
-def transforms_from_tf(message: Any) -> list[tuple[str, str, Pose]]:
-    """Each transform of a TFMessage as parent, child, ``parent_from_child``.
-
-    Raises:
-        DriveError: numbers that are no rigid transform.
-    """
-    transforms = []
+def _tf_message(message: Any) -> Iterator[TransformMessage]:
     for stamped in message.transforms:
         parent, child = frame_id_of(stamped.header), str(stamped.child_frame_id).lstrip("/")
         t, q = stamped.transform.translation, stamped.transform.rotation
-        numbers = np.array([t.x, t.y, t.z, q.x, q.y, q.z, q.w], dtype=np.float64)
-        if not np.all(np.isfinite(numbers)) or abs(np.linalg.norm(numbers[3:]) - 1.0) > 1e-2:
-            raise DriveError(f"the static transform from '{parent}' to '{child}' is no rigid transform: {numbers}")
-        transforms.append((parent, child, Pose(rotations_from_quat_xyzw(numbers[3:]), numbers[:3])))
-    return transforms
+        yield TransformMessage(
+            parent, child, rigid_transform(parent, child, (t.x, t.y, t.z), (q.x, q.y, q.z, q.w))
+        )
 
 
-def _camera(info_topic: str, width: int, height: int, K: Array, coefficients: tuple[float, ...]) -> Camera:
-    if K[0, 0] == 0.0:
-        raise CalibrationError(f"{info_topic} comes from an uncalibrated camera (its K is zero); calibrate it")
-    k1, k2, p1, p2, k3 = (*coefficients, 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
-    try:
-        return Camera(width, height, *_focal_and_centre(K), distortion=(k1, k2, p1, p2, k3))
-    except CalibrationError as error:
-        raise CalibrationError(f"{info_topic}: {error}") from error
+def _imu(message: Any) -> Iterator[ImuSample]:
+    angular, linear = message.angular_velocity, message.linear_acceleration
+    covariances = message.angular_velocity_covariance, message.linear_acceleration_covariance
+    if any(float(covariance[0]) == _NOT_MEASURED for covariance in covariances):
+        return
+    sample = imu_sample_of(
+        stamp_ns_of(message.header), (angular.x, angular.y, angular.z), (linear.x, linear.y, linear.z)
+    )
+    if sample is not None:
+        yield sample
 
 
-def _focal_and_centre(K: Array) -> tuple[float, float, float, float]:
-    return float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
+def _odometry(message: Any) -> Iterator[SpeedMessage]:
+    yield from _speed(message.header, str(message.child_frame_id).lstrip("/"), message.twist.twist.linear.x)
 
 
-def _is_covariance(covariance: Array) -> bool:
-    if not np.all(np.isfinite(covariance)):
-        return False
-    return bool(np.allclose(covariance, covariance.T) and np.linalg.eigvalsh(covariance)[0] > 0.0)
+def _twist_stamped(message: Any) -> Iterator[SpeedMessage]:
+    yield from _speed(message.header, frame_id_of(message.header), message.twist.linear.x)
+
+
+READINGS: Readings = {
+    COMPRESSED_IMAGE: Reading(IMAGES, _compressed_image),
+    IMAGE: Reading(IMAGES, _image),
+    CAMERA_INFO: Reading(CALIBRATIONS, _camera_info),
+    NAV_SAT_FIX: Reading(FIXES, _nav_sat_fix),
+    TF_MESSAGE: Reading(TRANSFORMS, _tf_message),
+    IMU: Reading(INERTIAL, _imu),
+    ODOMETRY: Reading(SPEEDS, _odometry),
+    TWIST_STAMPED: Reading(SPEEDS, _twist_stamped),
+}
+
+
+def _speed(header: Any, frame_id: str, speed_mps: Any) -> Iterator[SpeedMessage]:
+    if np.isfinite(speed_mps):
+        yield SpeedMessage(frame_id, WheelSpeed(stamp_ns_of(header), float(speed_mps)))
+
+
+def _letter(message: Any, name: str) -> Any:
+    """A matrix of a CameraInfo; a capital letter in ROS 1."""
+    return getattr(message, name) if hasattr(message, name) else getattr(message, name.upper())

@@ -2,9 +2,20 @@
 
 from __future__ import annotations
 
+import logging
 from collections import deque
 
+import numpy as np
+
+from fleetmap.drives.mcap_file import McapFile
+from fleetmap.drives.messages import TRANSFORMS
+from fleetmap.drives.ros2_messages import TF_MESSAGE, ros2_name
+from fleetmap.drives.topic_reading import read_values, topics_of
 from fleetmap.geometry import Pose
+
+_log = logging.getLogger(__name__)
+
+_CONSTANT_WITHIN = 1e-4  # metres, and elements of the rotation matrix: what republishing in float32 may change
 
 
 class StaticTransforms:
@@ -32,3 +43,36 @@ class StaticTransforms:
 
     def __len__(self) -> int:
         return sum(len(neighbours) for neighbours in self._neighbours.values()) // 2
+
+
+def read_static_transforms(mcap: McapFile) -> StaticTransforms:
+    """All mountings of a recording: ROS' /tf_static, and of Foxglove's transforms those that stay what they are.
+
+    Raises:
+        DriveError: a message that is no rigid transform.
+    """
+    mountings = StaticTransforms()
+    constant: dict[tuple[str, str], Pose] = {}
+    moving: set[tuple[str, str]] = set()
+    for topic in topics_of(mcap, TRANSFORMS):
+        if ros2_name(mcap.topics[topic].message_type) == TF_MESSAGE:
+            if topic.rpartition("/")[2] == "tf_static":
+                for found in read_values(mcap, TRANSFORMS, topic):
+                    mountings.add(found.parent, found.child, found.parent_from_child)
+            continue
+        for found in read_values(mcap, TRANSFORMS, topic):
+            frames = found.parent, found.child
+            if not _is_same(constant.setdefault(frames, found.parent_from_child), found.parent_from_child):
+                moving.add(frames)
+    for frames, parent_from_child in constant.items():
+        if frames not in moving:
+            mountings.add(*frames, parent_from_child)
+    for parent, child in sorted(moving):
+        _log.info("%s: '%s' moves in '%s'; that is no mounting", mcap.path.name, child, parent)
+    return mountings
+
+
+def _is_same(first: Pose, second: Pose) -> bool:
+    shift = np.abs(first.translation_m - second.translation_m).max()
+    turn = np.abs(first.rotation - second.rotation).max()
+    return bool(max(shift, turn) <= _CONSTANT_WITHIN)
