@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -22,6 +24,14 @@ _WIDTH_PX = 16384
 _MAX_HEIGHT_PX = 32000  # cv2.remap addresses pixels with 16 bits
 
 
+class Opacities(NamedTuple):
+    """Where see-through textures are solid: the mip pyramids of all of them in one row of texels."""
+
+    texels: NDArray[np.uint8]  # (N,) 255 solid, 0 see-through
+    level_starts: NDArray[np.int64]  # (T, MAX_LEVEL + 1) first texel of each level; -1: solid everywhere
+    level_sizes: NDArray[np.int64]  # (T, MAX_LEVEL + 1, 2) width, height
+
+
 @dataclass(frozen=True)
 class Atlas:
     """Level (i, j) of a texture of size (w, h) at (x, y) starts at x + 2w(1 - 2**-i), y + 2h(1 - 2**-j)."""
@@ -30,6 +40,19 @@ class Atlas:
     origins_px: NDArray[np.float32]  # (T, 2) x, y of each texture
     sizes_px: NDArray[np.float32]  # (T, 2) width, height of each texture at level (0, 0)
     opacities: tuple[tuple[GreyImage, ...] | None, ...]  # a plain mip pyramid for each see-through texture
+
+    @cached_property
+    def packed_opacities(self) -> Opacities:
+        """The same pyramids for compiled loops."""
+        starts = np.full((len(self.opacities), MAX_LEVEL + 1), -1, dtype=np.int64)
+        sizes = np.ones((len(self.opacities), MAX_LEVEL + 1, 2), dtype=np.int64)
+        texels, end = [np.zeros(1, dtype=np.uint8)], 1
+        for texture, pyramid in enumerate(self.opacities):
+            for level, picture in enumerate(pyramid or ()):
+                starts[texture, level], sizes[texture, level] = end, picture.shape[::-1]
+                texels.append(picture.ravel())
+                end += picture.size
+        return Opacities(np.concatenate(texels), starts, sizes)
 
 
 def build_atlas(textures: Sequence[Texture]) -> Atlas:

@@ -53,7 +53,7 @@ class Look:
             noise *= np.float32(self.noise_sigma * amplified / 255.0 / 0.775)
             image += noise
         image *= np.float32(255.0)
-        return np.asarray(cv2.convertScaleAbs(cv2.max(image, 0.0)), dtype=np.uint8)
+        return np.asarray(cv2.convertScaleAbs(np.maximum(image, np.float32(0.0))), dtype=np.uint8)
 
     def surface_light(self, brightness: NDArray[np.float64]) -> NDArray[np.float64]:
         """Brightness (Q,) of surfaces under the sun they were built in, as it is in this look's light."""
