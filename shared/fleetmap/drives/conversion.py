@@ -17,7 +17,8 @@ import numpy as np
 from fleetmap.camera import Camera
 from fleetmap.drive import GnssFix, ImuSample
 from fleetmap.drives.image_codec import Image, decode_compressed
-from fleetmap.drives.ros2_writer import DriveWriter
+from fleetmap.drives.ros2_messages import COMPRESSED_IMAGE, IMAGE, NAV_SAT_FIX
+from fleetmap.drives.ros2_writer import IMU, DriveWriter
 from fleetmap.errors import CalibrationError, DriveError
 from fleetmap.geometry import Pose
 from fleetmap.gnss import GNSS_ERROR_MODELS, sample_fixes
@@ -25,6 +26,8 @@ from fleetmap.trajectory import Trajectory, write_trajectory
 
 Progress = Callable[[str, int, int], None]  # stage, done, total
 Message = tuple[int, Callable[[], None]]  # its stamp in ns, and what writes it
+
+START_NS = 1_700_000_000 * 1_000_000_000  # 2023-11-14T22:13:20Z: where recordings with relative times start
 
 _JPEG_MAGIC, _PNG_MAGIC = b"\xff\xd8", b"\x89PNG\r\n\x1a\n"
 _LAST_ROS_STAMP_NS = (2**31 - 1) * 1_000_000_000  # builtin_interfaces/Time counts seconds in 32 bits, until 2038
@@ -62,6 +65,22 @@ class SimulatedGnss:
     seed: int = 0
 
 
+def conclude(
+    writer: DriveWriter, recording: Path, reference: Trajectory | None = None, remarks: tuple[str, ...] = ()
+) -> Conversion:
+    """Write the reference beside the recording that ``writer`` has finished, and say what was written."""
+    counts = writer.message_counts
+    return Conversion(
+        recording,
+        frame_count=counts[COMPRESSED_IMAGE],
+        fix_count=counts[NAV_SAT_FIX],
+        reference=_write_reference(recording, reference),
+        imu_count=counts[IMU],
+        depth_count=counts[IMAGE],
+        remarks=remarks,
+    )
+
+
 def silent(stage: str, done: int, total: int) -> None:
     """Shows no progress."""
 
@@ -69,16 +88,6 @@ def silent(stage: str, done: int, total: int) -> None:
 def reference_path(recording: Path) -> Path:
     """``survey.mcap`` -> ``survey.reference.tum``."""
     return recording.with_name(f"{recording.stem}.reference.tum")
-
-
-def write_reference(recording: Path, reference: Trajectory | None) -> Path | None:
-    """Write the reference beside its recording; an older one that belongs to nothing any more is removed."""
-    path = reference_path(recording)
-    if reference is None:
-        path.unlink(missing_ok=True)
-        return None
-    write_trajectory(path, reference)
-    return path
 
 
 def simulated_fixes(reference: Trajectory, gnss: SimulatedGnss) -> list[GnssFix]:
@@ -173,6 +182,16 @@ def read_bytes(path: Path) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise DriveError(f"cannot read {path}: {error.strerror or error}") from error
+
+
+def _write_reference(recording: Path, reference: Trajectory | None) -> Path | None:
+    """Write the reference beside its recording; an older one that belongs to nothing any more is removed."""
+    path = reference_path(recording)
+    if reference is None:
+        path.unlink(missing_ok=True)
+        return None
+    write_trajectory(path, reference)
+    return path
 
 
 def _write_image(writer: DriveWriter, image: StampedImage, camera: Camera) -> None:

@@ -14,9 +14,11 @@ import numpy as np
 from fleetmap.camera import Camera
 from fleetmap.drive import GnssFix
 from fleetmap.drives.conversion import (
+    START_NS,
     Conversion,
     Progress,
     SimulatedGnss,
+    conclude,
     fix_messages,
     image_messages,
     mount_antenna,
@@ -25,7 +27,6 @@ from fleetmap.drives.conversion import (
     silent,
     simulated_fixes,
     write_in_time_order,
-    write_reference,
 )
 from fleetmap.drives.kitti import (
     NumberedImage,
@@ -43,8 +44,6 @@ from fleetmap.errors import CalibrationError, DriveError
 from fleetmap.geodesy import UtmGrid
 from fleetmap.geometry import Array, Pose
 from fleetmap.trajectory import Trajectory
-
-START_NS = 1_700_000_000 * 1_000_000_000  # 2023-11-14T22:13:20Z: where recordings with relative times start
 
 
 @dataclass(frozen=True)
@@ -115,7 +114,7 @@ def convert_kitti_odometry(
         write_in_time_order(
             image_messages(writer, images, calibrated, progress), fix_messages(writer, fixes, gnss_frame_id)
         )
-    return Conversion(output, len(images), len(fixes), write_reference(output, reference))
+    return conclude(writer, output, reference)
 
 
 def place_poses(poses: list[Pose], origin: Origin) -> list[Pose]:

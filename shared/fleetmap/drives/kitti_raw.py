@@ -17,13 +17,13 @@ from fleetmap.drive import GnssFix
 from fleetmap.drives.conversion import (
     Conversion,
     Progress,
+    conclude,
     fix_messages,
     image_messages,
     read_lines,
     seconds_as_ns,
     silent,
     write_in_time_order,
-    write_reference,
 )
 from fleetmap.drives.kitti import (
     baseline_shift_m,
@@ -97,7 +97,7 @@ def convert_kitti_raw(
         write_in_time_order(
             image_messages(writer, images, mounted.camera, progress), fix_messages(writer, fixes, "imu")
         )
-    return Conversion(output, len(images), len(fixes), write_reference(output, reference))
+    return conclude(writer, output, reference)
 
 
 def _find_layout(folder: Path, camera: int) -> _Layout:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
@@ -30,11 +31,8 @@ from fleetmap.errors import CalibrationError
 from fleetmap.files import atomic_path, refuse_existing
 from fleetmap.geometry import Array, Pose, quat_xyzw_from_rotations
 
-_IMU, _TWIST_STAMPED, _LASER_SCAN = (
-    "sensor_msgs/msg/Imu",
-    "geometry_msgs/msg/TwistStamped",
-    "sensor_msgs/msg/LaserScan",
-)
+IMU = "sensor_msgs/msg/Imu"
+_TWIST_STAMPED, _LASER_SCAN = "geometry_msgs/msg/TwistStamped", "sensor_msgs/msg/LaserScan"
 _TF_STATIC_TOPIC = "/tf_static"
 _COVARIANCE_KNOWN, _FIX, _GPS = 3, 0, 1  # constants of sensor_msgs/NavSatFix and NavSatStatus
 _NOT_MEASURED = -1.0  # first element of a sensor_msgs/Imu covariance whose quantity the sensor does not give
@@ -82,6 +80,7 @@ class DriveWriter:
         self._types = standard_typestore().types
         self._transforms: list[tuple[str, str, Pose]] = []
         self._channel_ids: dict[str, int] = {}
+        self.message_counts: Counter[str] = Counter()  # of each type, such as sensor_msgs/msg/Imu
         self._first_stamp_ns: int | None = None
         self._stack = ExitStack()
         self._file: IO[bytes]
@@ -149,7 +148,7 @@ class DriveWriter:
         Covariances (3, 3) in (rad/s)^2 and (m/s^2)^2; None says that they are not known, as ROS does with zeros.
         """
         unknown = np.zeros((3, 3))
-        message = self._types[_IMU](
+        message = self._types[IMU](
             header=self._header(sample.stamp_ns, frame_id),
             orientation=self._quaternion(np.array([0.0, 0.0, 0.0, 1.0])),
             orientation_covariance=np.array([_NOT_MEASURED, *(0.0,) * 8]),
@@ -255,14 +254,15 @@ class DriveWriter:
         self._write(_TF_STATIC_TOPIC, self._types[TF_MESSAGE](transforms=stamped), stamp_ns)
 
     def _write(self, topic: str, message: Any, stamp_ns: int) -> None:
+        message_type: str = message.__msgtype__
         if topic not in self._channel_ids:
-            message_type: str = message.__msgtype__
             schema_id = self._writer.register_schema(
                 message_type, "ros2msg", definition_text(message_type).encode()
             )
             self._channel_ids[topic] = self._writer.register_channel(topic, "cdr", schema_id)
         if self._first_stamp_ns is None or stamp_ns < self._first_stamp_ns:
             self._first_stamp_ns = stamp_ns
+        self.message_counts[message_type] += 1
         self._writer.add_message(self._channel_ids[topic], stamp_ns, encode(message), stamp_ns)
 
     def _header(self, stamp_ns: int, frame_id: str) -> Any:

@@ -12,8 +12,8 @@ from pyproj import Geod
 
 from fleetmap.camera import Camera
 from fleetmap.drives import open_drive
-from fleetmap.drives.conversion import SimulatedGnss
-from fleetmap.drives.kitti_odometry import START_NS, Origin, convert_kitti_odometry
+from fleetmap.drives.conversion import START_NS, SimulatedGnss
+from fleetmap.drives.kitti_odometry import Origin, convert_kitti_odometry
 from fleetmap.errors import CalibrationError, DriveError, InputError
 from fleetmap.geodesy import UtmGrid
 from fleetmap.geometry import Pose, so3_exp
