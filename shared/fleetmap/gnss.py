@@ -81,17 +81,26 @@ def sample_fixes(
         InputError: a reference of fewer than two poses, or a spacing or gap that makes no sense.
     """
     stamps_ns = fix_stamps_ns(reference.stamps_ns, interval_s)
-    errors_enu_m = model.sample_errors_enu_m(stamps_ns, np.random.default_rng(seed))
     positions_m = antenna_positions_m(reference, stamps_ns, antenna_in_cam_m)
-    positions_m = _displace(UtmGrid(reference.epsg), positions_m, errors_enu_m)
-    lat_deg, lon_deg, height_m = UtmGrid(reference.epsg).to_geodetic(positions_m)
+    return [
+        fix
+        for fix in fixes_at(UtmGrid(reference.epsg), stamps_ns, positions_m, model, seed)
+        if gap_s is None or not in_gap(fix.stamp_ns - int(reference.stamps_ns[0]), gap_s)
+    ]
+
+
+def fixes_at(
+    grid: UtmGrid, stamps_ns: Stamps, antennas_in_utm_m: Array, model: GnssErrorModel, seed: int
+) -> list[GnssFix]:
+    """The fixes that a receiver reports of its antenna's true positions (N, 3) at stamps (N,)."""
+    errors_enu_m = model.sample_errors_enu_m(stamps_ns, np.random.default_rng(seed))
+    lat_deg, lon_deg, height_m = grid.to_geodetic(_displace(grid, antennas_in_utm_m, errors_enu_m))
     covariance_enu_m2 = np.eye(3) * model.reported_sigma_m**2
     return [
         GnssFix(stamp_ns, lat, lon, height, covariance_enu_m2)
         for stamp_ns, lat, lon, height in zip(
             stamps_ns.tolist(), lat_deg.tolist(), lon_deg.tolist(), height_m.tolist(), strict=True
         )
-        if gap_s is None or not _in_gap(stamp_ns - int(reference.stamps_ns[0]), gap_s)
     ]
 
 
@@ -135,6 +144,7 @@ def _displace(grid: UtmGrid, positions_m: Array, errors_enu_m: Array) -> Array:
     return moved
 
 
-def _in_gap(since_start_ns: int, gap_s: tuple[float, float]) -> bool:
+def in_gap(since_start_ns: int, gap_s: tuple[float, float]) -> bool:
+    """Whether a moment lies in a gap: its start and its length."""
     start_s, length_s = gap_s
     return start_s <= since_start_ns * 1e-9 < start_s + length_s

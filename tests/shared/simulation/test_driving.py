@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from fleetmap.errors import InputError
-from fleetmap.geometry import rotation_angle_rad
-from fleetmap.simulation.driving import START_NS, drive_along
+from fleetmap.geometry import Pose, rotation_angle_rad
+from fleetmap.simulation.driving import START_NS, drive_along, plan_motion
 from fleetmap.simulation.street import Street
+from fleetmap.simulation.world import build_world
 
 
 def test_it_keeps_speed_rate_and_height(street: Street) -> None:
@@ -64,7 +65,34 @@ def test_the_street_bends_and_climbs(street: Street) -> None:
     assert 0.05 < np.ptp(street.path.positions_m[:, 2]) < 5.0
 
 
+def test_it_slows_down_where_a_bend_would_be_uncomfortable(street: Street) -> None:
+    motion = plan_motion(street, speed_mps=14.0)
+    felt = motion.felt_by(Pose.identity(), np.arange(0.0, motion.duration_s, 0.01))
+    speeds_mps = np.linalg.norm(felt.velocity_m_s, axis=1)
+    sideways, ahead = felt.acceleration_m_s2[:, 0], felt.acceleration_m_s2[:, 2]
+    assert 7.5 < speeds_mps.min() < 9.0  # sqrt(2.5 m/s2 * 27 m) = 8.2 m/s
+    assert speeds_mps.max() > speeds_mps.min() + 0.5
+    assert 2.0 < np.abs(sideways).max() < 3.3
+    assert -2.5 < ahead.min() < ahead.max() < 2.0
+    even = plan_motion(street, speed_mps=14.0, slow_in_bends=False)
+    assert even.duration_s < 0.9 * motion.duration_s
+
+
+def test_laps_of_a_circuit_follow_one_another_without_a_seam() -> None:
+    world = build_world(3, kind="city", length_m=200.0)
+    motion = plan_motion(world, speed_mps=8.0, start_m=150.0, end_m=500.0)
+    seconds = np.arange(0.0, motion.duration_s, 0.02)
+    felt = motion.felt_by(Pose.identity(), seconds)
+    assert np.linalg.norm(felt.acceleration_m_s2, axis=1).max() < 5.0
+    assert np.degrees(np.linalg.norm(felt.angular_velocity_rad_s, axis=1)).max() < 60.0
+    _, positions = motion.poses(seconds)
+    lap = np.linalg.norm(positions - world.path.at(150.0, 0.0, 1.65), axis=1)
+    assert lap[0] < 0.3
+    later = seconds > 10.0
+    assert lap[later].min() < 0.3
+
+
 @pytest.mark.parametrize("nonsense", [{"speed_mps": 0.0}, {"rate_hz": -1.0}, {"start_m": 30.0, "end_m": 20.0}])
 def test_a_drive_that_makes_no_sense_is_refused(street: Street, nonsense: dict[str, float]) -> None:
-    with pytest.raises(InputError, match="cannot drive from"):
+    with pytest.raises(InputError, match=r"cannot drive from|make no sense"):
         drive_along(street, **nonsense)
