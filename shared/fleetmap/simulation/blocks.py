@@ -19,9 +19,9 @@ from fleetmap.simulation.ground import (
     lay_ground,
 )
 from fleetmap.simulation.palette import Palette
-from fleetmap.simulation.path import Line
-from fleetmap.simulation.relief import Terrain
-from fleetmap.simulation.roads import LANE_M, RoadPath, circuit_length_m
+from fleetmap.simulation.plot import GridLine, Kerb, Plot, marker_places
+from fleetmap.simulation.relief import Terrain, shape_profile
+from fleetmap.simulation.roads import LANE_M, RoadPath, circuit_length_m, closed_path
 from fleetmap.simulation.surfaces import SurfaceBuilder
 
 Array = NDArray[np.float64]
@@ -32,36 +32,8 @@ _BLOCK_M = 100.0  # about, from street to street
 _BEYOND_M = 95.0  # streets reach so far beyond the outermost crossings
 _LINED_M = 72.0  # houses, trees and cars stand so far from the path
 _DEEPEST_M = 12.5  # houses with their front gardens
+_BAND_HALF_M = 8.8  # a street and its crossings lie on one slope across
 _CORNER_M = 15.0  # kept free at the ends of the streets along v: the others' corner houses are there
-
-
-@dataclass(frozen=True)
-class Kerb:
-    """Where cars park: beside a line, between two places along it."""
-
-    line: Line
-    left_m: float
-    span_m: tuple[float, float]
-
-
-@dataclass(frozen=True)
-class GridLine:
-    """A straight line over a terrain, along one of its axes."""
-
-    terrain: Terrain
-    start_uv: tuple[float, float]
-    along_v: bool
-
-    def at(self, s_m: Array | float, left_m: Array | float = 0.0, above_m: Array | float = 0.0) -> Array:
-        """Map points (..., 3) beside the line, above the ground."""
-        s, left = np.asarray(s_m, dtype=np.float64), np.asarray(left_m, dtype=np.float64)
-        along, across = (-left, s) if self.along_v else (s, left)
-        return self.terrain.at(self.start_uv[0] + along, self.start_uv[1] + across, above_m)
-
-    def heading_rad(self, s_m: Array | float) -> Array:
-        """Its direction, counter-clockwise from grid east."""
-        heading = self.terrain.heading_rad + (np.pi / 2.0 if self.along_v else 0.0)
-        return np.full(np.shape(s_m), heading)
 
 
 @dataclass(frozen=True)
@@ -72,6 +44,31 @@ class Street:
     length_m: float
     deepest_m: float  # room for houses on either side
     corners_free: bool
+
+
+def lay_city(rng: Rng, builder: SurfaceBuilder, palette: Palette, length_m: float, *, alike: bool = False) -> Plot:
+    """A circuit of a given length around some blocks of a city."""
+    path, grid = lay_circuit(rng, length_m, steepest=0.08)
+    kerbs = build_blocks(rng, builder, palette, path, grid, alike=alike)
+    return Plot(path, kerbs, marker_places(path, 45.0, (-5.3, 8.8)))
+
+
+def lay_facades(rng: Rng, builder: SurfaceBuilder, palette: Palette, length_m: float) -> Plot:
+    """The same where all houses look alike."""
+    return lay_city(rng, builder, palette, length_m, alike=True)
+
+
+def lay_circuit(rng: Rng, length_m: float, steepest: float) -> tuple[RoadPath, StreetGrid]:
+    """A circuit over hills that begins at the map's origin, and the streets around it."""
+    grid, corners = plan_circuit(rng, length_m)
+    band = np.array([-_BAND_HALF_M, _BAND_HALF_M])
+    along, across = (
+        shape_profile(rng, axes[:, None] + band, 0.5 * steepest, steepest, 60.0)
+        for axes in (grid.columns_m, grid.rows_m)
+    )
+    heading = float(rng.uniform(-np.pi, np.pi))
+    start = closed_path(Terrain(heading, np.zeros(3), along, across), corners).at(0.0)
+    return closed_path(Terrain(heading, -start, along, across), corners), grid
 
 
 def plan_circuit(rng: Rng, length_m: float) -> tuple[StreetGrid, Array]:
@@ -126,19 +123,33 @@ def build_blocks(
     """
     ground_rng, house_rng, tree_rng = rng.spawn(3)
     lay_ground(ground_rng, builder, palette, path, grid)
+    kerbs: list[Kerb] = []
+    for street in streets_near(path, grid):
+        kerbs += line_street(house_rng, tree_rng, builder, palette, street, alike=alike)
+    return kerbs
+
+
+def line_street(
+    house_rng: Rng,
+    tree_rng: Rng,
+    builder: SurfaceBuilder,
+    palette: Palette,
+    street: Street,
+    *,
+    alike: bool = False,
+) -> list[Kerb]:
+    """Build houses, trees, lamps and signs along a street, and say where cars may park."""
     trees = TreePaint(palette.crowns(), palette.bark())
     things = FurniturePaint(palette.metal(), palette.signs(), palette.boxes())
-    kerbs = []
-    for street in streets_near(path, grid):
-        length = street.length_m
-        for side in (-1.0, 1.0):
-            row = build_terrace if alike else build_row
-            row(house_rng, builder, palette, path, street, side)
-            span = np.array([4.0, length - 4.0])
-            furniture.plant_trees(tree_rng, builder, trees, street.line, side * (ROAD_HALF_M + 1.2), span)
-            furniture.place_furniture(tree_rng, builder, things, street.line, side * (ROAD_HALF_M + 0.45), span)
-            if length > 20.0:
-                kerbs.append(Kerb(street.line, side * (ROAD_HALF_M - 1.05), (6.0, length - 6.0)))
+    length, kerbs = street.length_m, []
+    for side in (-1.0, 1.0):
+        row = build_terrace if alike else build_row
+        row(house_rng, builder, palette, street, side)
+        span = np.array([4.0, length - 4.0])
+        furniture.plant_trees(tree_rng, builder, trees, street.line, side * (ROAD_HALF_M + 1.2), span)
+        furniture.place_furniture(tree_rng, builder, things, street.line, side * (ROAD_HALF_M + 0.45), span)
+        if length > 20.0:
+            kerbs.append(Kerb(street.line, side * (ROAD_HALF_M - 1.05), (6.0, length - 6.0)))
     return kerbs
 
 
@@ -171,9 +182,7 @@ def _near_part(path: RoadPath, axis: float, start: float, end: float, along_v: b
     return float(near[0]), float(min(near[-1] + 2.0, end))
 
 
-def build_row(
-    rng: Rng, builder: SurfaceBuilder, palette: Palette, path: RoadPath, street: Street, side: float
-) -> None:
+def build_row(rng: Rng, builder: SurfaceBuilder, palette: Palette, street: Street, side: float) -> None:
     """Houses of different width, height and setback along one side; now and then a gap or a small park."""
     s, end = _row_span(street)
     hidden = palette.side(rng, 8.0, 6.0)
@@ -194,9 +203,7 @@ def build_row(
         s += width + float(rng.choice([0.0, 0.0, 1.5, 4.0, 8.0]))
 
 
-def build_terrace(
-    rng: Rng, builder: SurfaceBuilder, palette: Palette, path: RoadPath, street: Street, side: float
-) -> None:
+def build_terrace(rng: Rng, builder: SurfaceBuilder, palette: Palette, street: Street, side: float) -> None:
     """Houses of one size side by side, whose fronts differ in details only."""
     start, end = _row_span(street)
     count = int((end - start) // _ALIKE_WIDTH_M)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,9 +45,24 @@ class _Interval:
 
 
 def lay_ground(
-    rng: Rng, builder: SurfaceBuilder, palette: Palette, path: RoadPath, grid: StreetGrid, *, paved: bool = True
+    rng: Rng,
+    builder: SurfaceBuilder,
+    palette: Palette,
+    path: RoadPath,
+    grid: StreetGrid,
+    *,
+    paved_u: Sequence[tuple[float, float]] | None = None,
+    light: Callable[[float], float] = lambda u: 1.0,
 ) -> None:
-    """Lay what is near a path of a grid of streets; without ``paved``, verges take the place of pavements."""
+    """Lay what is near a path of a grid of streets.
+
+    Args:
+        rng, builder, palette: what lays and paints.
+        path: along one or some of the streets.
+        grid: the streets.
+        paved_u: the only stretches along u that have pavements instead of verges; by default all have.
+        light: share of the daylight at u; 1 outside of tunnels.
+    """
     terrain = path.terrain
     across = _intervals(grid.columns_m, grid.start_uv[0], grid.end_uv[0])
     down = _intervals(grid.rows_m, grid.start_uv[1], grid.end_uv[1])
@@ -55,7 +71,9 @@ def lay_ground(
     distance = path.distance_m(centres)
     for (u, v), far_m in zip(cells, distance.tolist(), strict=True):
         if far_m < (_YARD_REACH_M if u.kind == v.kind == _YARD else STREET_REACH_M):
-            _lay_cell(rng, builder, palette, terrain, u, v, paved)
+            middle = (u.low + u.high) / 2.0
+            paved = paved_u is None or any(low <= middle < high for low, high in paved_u)
+            _lay_cell(rng, builder, palette, terrain, u, v, paved, light(middle))
 
 
 def _intervals(axes_m: Array, start_m: float, end_m: float) -> list[_Interval]:
@@ -84,6 +102,7 @@ def _lay_cell(
     u: _Interval,
     v: _Interval,
     paved: bool,
+    light: float,
 ) -> None:
     """One piece of ground; a road's pieces have their textures' rows across it."""
     kinds, shade = {u.kind, v.kind}, float(rng.uniform(0.95, 1.05))
@@ -94,27 +113,37 @@ def _lay_cell(
     if rng.random() < 0.5:
         corners = np.roll(corners, 2, axis=0)
     if _ROAD in kinds:
-        paint = _road_paint(rng, palette, kinds)
+        paint = _road_paint(rng, palette, kinds, in_tunnel=light < 1.0)
+    elif light < 1.0:
+        paint = palette.pick(
+            rng, "walkway", 4, lambda own: textures.paint_plain(own, PIECE_M, PAVEMENT_M, 140.0, 14.0)
+        )
     elif _PAVEMENT in kinds and paved:
         paint = palette.pick(rng, "pavement", 16, lambda own: textures.paint_pavement(own, PIECE_M, PAVEMENT_M))
     else:
         paint = palette.pick(rng, "lawn", 10, lambda own: textures.paint_grass(own, PIECE_M, PIECE_M, 20.0))
-    builder.add_quad(corners, paint, shade=shade)
+    builder.add_quad(corners, paint, shade=shade * light, lit=light == 1.0)
     if kinds == {_PAVEMENT, _YARD} or kinds == {_PAVEMENT}:
-        _lay_kerbs(builder, palette, terrain, u, v)
+        _lay_kerbs(builder, palette, terrain, u, v, light)
 
 
-def _road_paint(rng: Rng, palette: Palette, kinds: set[str]) -> int:
+def _road_paint(rng: Rng, palette: Palette, kinds: set[str], *, in_tunnel: bool) -> int:
     width = 2.0 * ROAD_HALF_M
     if kinds == {_ROAD}:
         return palette.pick(rng, "junction", 6, lambda own: textures.paint_road(own, width, width, []))
     if _PAVEMENT in kinds:
         return palette.pick(rng, "crossing", 8, lambda own: textures.paint_crossing(own, PAVEMENT_M, width))
     lines = list(_MARKINGS_M)
+    if in_tunnel:
+        return palette.pick(
+            rng, "tunnel road", 12, lambda own: textures.paint_road(own, PIECE_M, width, lines, shadows=False)
+        )
     return palette.pick(rng, "road", 36, lambda own: textures.paint_road(own, PIECE_M, width, lines))
 
 
-def _lay_kerbs(builder: SurfaceBuilder, palette: Palette, terrain: Terrain, u: _Interval, v: _Interval) -> None:
+def _lay_kerbs(
+    builder: SurfaceBuilder, palette: Palette, terrain: Terrain, u: _Interval, v: _Interval, light: float
+) -> None:
     """The step down to the road."""
     stone = palette.numbered("kerb", 0, lambda own: textures.paint_plain(own, PIECE_M, KERB_HEIGHT_M, 170.0, 14.0))
     low = ground_corners(terrain, (u.low, u.high), (v.low, v.high), 0.0)
@@ -124,7 +153,7 @@ def _lay_kerbs(builder: SurfaceBuilder, palette: Palette, terrain: Terrain, u: _
     ):
         if is_step:
             i, j = side, (side + 1) % 4
-            builder.add_quad(np.stack([high[j], high[i], low[i], low[j]]), stone)
+            builder.add_quad(np.stack([high[j], high[i], low[i], low[j]]), stone, shade=light, lit=light == 1.0)
 
 
 def ground_corners(

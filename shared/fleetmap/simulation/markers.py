@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 from fleetmap.geometry import Pose
 from fleetmap.simulation.canvas import GreyImage
 from fleetmap.simulation.palette import Palette
-from fleetmap.simulation.path import Line
+from fleetmap.simulation.plot import Plot, under_roof
 from fleetmap.simulation.surfaces import SurfaceBuilder, raised
 
 Array = NDArray[np.float64]
@@ -22,7 +21,7 @@ _MODULES = 7  # of the black square's side: five of the code, and its rim
 _SIDE_M, _BOARD_M = 0.56, 0.72  # the board shows a white module around the square
 _MIDDLE_ABOVE_M, _BOARD_PX = 2.3, 320
 _TOWARDS_ROAD_RAD = 0.15
-_LARGEST_NUMBER = 250
+_MOST_MARKERS = 250
 
 
 @dataclass(frozen=True)
@@ -42,12 +41,11 @@ class Marker:
         return self.map_from_marker.transform(corners)
 
 
-def set_up_markers(
-    builder: SurfaceBuilder, palette: Palette, line: Line, places: Sequence[tuple[float, float]]
-) -> tuple[Marker, ...]:
-    """Boards on poles at places (s, left) beside a line; each looks back along it and a little towards it."""
-    markers = []
-    for number, (s, left) in enumerate(places[:_LARGEST_NUMBER]):
+def set_up_markers(builder: SurfaceBuilder, palette: Palette, plot: Plot) -> tuple[Marker, ...]:
+    """Boards on poles at a plot's places; each looks back along the path and a little towards it."""
+    markers, line = [], plot.path
+    for number, (s, left) in enumerate(plot.marker_places[:_MOST_MARKERS]):
+        light = float(under_roof(s, plot.tunnels_m))
         foot = line.at(s, left)
         heading = float(line.heading_rad(s)) + np.pi - np.sign(left) * -_TOWARDS_ROAD_RAD
         out = np.array([np.cos(heading), np.sin(heading), 0.0])
@@ -57,7 +55,7 @@ def set_up_markers(
         markers.append(Marker(number, DICTIONARY, _SIDE_M, pose))
         board = builder.add_texture(_paint_board(number))
         half = _BOARD_M / 2.0 * np.array([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])
-        builder.add_quad(pose.transform(half), board)
+        builder.add_quad(pose.transform(half), board, lit=light == 1.0, shade=light)
         height = _MIDDLE_ABOVE_M + _BOARD_M / 2.0
         builder.add_box(foot - 0.06 * out, heading, (0.08, 0.08, height), palette.metal())
         back = half[[1, 0, 3, 2]] - [0.0, 0.0, 0.01]

@@ -16,7 +16,9 @@ Rng = np.random.Generator
 WALL_PX_PER_M = 40.0
 
 
-def paint_road(rng: Rng, length_m: float, width_m: float, lane_lines_m: list[float]) -> GreyImage:
+def paint_road(
+    rng: Rng, length_m: float, width_m: float, lane_lines_m: list[float], *, shadows: bool = True
+) -> GreyImage:
     """Asphalt seen from above, rows along the road; ``lane_lines_m`` are measured from its left edge."""
     road = Canvas(rng, width_m, length_m, 40.0, float(rng.uniform(108.0, 122.0)))
     road.grain(9.0, 4.0, 0.8)
@@ -41,7 +43,8 @@ def paint_road(rng: Rng, length_m: float, width_m: float, lane_lines_m: list[flo
             patch = road.patch(line - 0.06, y, line + 0.06, y + 3.0)
             worn = fractal_noise(rng, (patch.shape[0], patch.shape[1]), 16.0) > 1.1
             patch[~worn] = 205.0
-    _cast_shadows(road)
+    if shadows:
+        _cast_shadows(road)
     return road.finish()
 
 
@@ -247,6 +250,43 @@ def _paint_clutter(wall: Canvas) -> None:
         patch[leaves] = (70.0 + 30.0 * fractal_noise(rng, shape, 8.0, 0.9))[leaves]
 
 
+def paint_tunnel_wall(rng: Rng, width_m: float, height_m: float) -> GreyImage:
+    """Concrete panels with a light band, cables, stains; now and then a door, a niche or a sign."""
+    wall = Canvas(rng, width_m, height_m, WALL_PX_PER_M, float(rng.uniform(120.0, 140.0)))
+    wall.grain(10.0, 3.0, 0.85)
+    for x in np.arange(0.0, width_m, 2.0):
+        wall.darken(x, 0.0, x + 0.04, height_m, 0.5)
+    wall.rectangle(0.0, height_m - 1.5, width_m, height_m - 1.2, 200.0, 9.0)
+    for y in (1.1, 1.25):
+        wall.rectangle(0.0, y, width_m, y + 0.05, 60.0, 8.0)
+    for _ in range(int(width_m * 1.5)):
+        x, top = rng.uniform(0.0, width_m), rng.uniform(0.0, height_m)
+        wall.darken(x, top, x + rng.uniform(0.05, 0.5), top + rng.uniform(0.5, 3.0), float(rng.uniform(0.7, 0.95)))
+    kind, x = rng.random(), float(rng.uniform(0.5, width_m - 2.0))
+    if kind < 0.3:
+        wall.rectangle(x, height_m - 2.2, x + 1.1, height_m, float(rng.choice([50.0, 210.0])), 6.0)
+        wall.text(x + 0.15, height_m - 1.6, 0.25, 128.0, 3)
+    elif kind < 0.6:
+        wall.rectangle(x, 1.8, x + 0.9, 2.7, 235.0, 4.0)
+        wall.text(x + 0.08, 2.4, 0.3, 40.0, 3)
+    for _ in range(int(rng.integers(2, 7))):
+        x, y, size = rng.uniform(0.2, width_m), rng.uniform(1.4, height_m), rng.uniform(0.08, 0.35)
+        wall.rectangle(x, y, x + size, y + size, float(rng.uniform(20.0, 230.0)), 8.0)
+    return wall.finish()
+
+
+def paint_bays(rng: Rng, size_m: float) -> GreyImage:
+    """Asphalt or setts of a wide place, with or without the lines of parking bays."""
+    place = Canvas(rng, size_m, size_m, 32.0, 0.0)
+    road = paint_road(rng, size_m, size_m, [])
+    place.grey = cv2.resize(road, place.grey.shape[::-1], interpolation=cv2.INTER_AREA).astype(np.float32)
+    if rng.random() < 0.5:
+        for x in np.arange(0.0, size_m, 2.5):
+            place.rectangle(x, 0.0, x + 0.1, 4.8, 195.0, 12.0)
+        place.rectangle(0.0, 4.8, size_m, 4.9, 195.0, 12.0)
+    return place.finish()
+
+
 def paint_roof(rng: Rng, width_m: float, height_m: float) -> GreyImage:
     """Rows of tiles with skylights and a chimney's shadow."""
     roof = Canvas(rng, width_m, height_m, 24.0, float(rng.uniform(70.0, 125.0)))
@@ -292,13 +332,20 @@ def paint_sign(rng: Rng, width_m: float, height_m: float) -> GreyImage:
     return sign.finish()
 
 
-def paint_horizon(rng: Rng, width_m: float, height_m: float, sky_grey: float) -> GreyImage:
-    """Far roofs, trees and hills below the sky; the top row is sky. 400 rows, however far and high they are."""
+def paint_horizon(
+    rng: Rng, width_m: float, height_m: float, sky_grey: float, *, seamless: bool = False
+) -> GreyImage:
+    """Far roofs, trees and hills below the sky; the top row is sky. 400 rows, however far and high they are.
+
+    ``seamless``: every ridge meets that of any other picture beside it.
+    """
     scene = Canvas(rng, width_m, height_m, 400.0 / height_m, sky_grey)
     rows, columns = scene.grey.shape
     x = np.arange(columns)
     for layer, (top, grey) in enumerate(((0.32, 190.0), (0.25, 160.0), (0.19, 115.0))):
         ridge = fractal_noise(rng, (64, columns), columns / 2.0, 0.4 + 0.08 * layer)[32]
+        if seamless:
+            ridge = ridge * np.minimum(np.minimum(x, x[::-1]) / (0.15 * columns), 1.0)
         heights = np.clip(rows * (top + 0.05 * ridge), 4, 0.9 * rows)
         if layer == 2:  # houses: steps instead of hills
             heights = np.repeat(heights[::40], 40)[:columns]

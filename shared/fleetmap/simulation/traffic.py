@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.simulation import furniture
-from fleetmap.simulation.blocks import Kerb
 from fleetmap.simulation.palette import Palette
 from fleetmap.simulation.path import Line
+from fleetmap.simulation.plot import Kerb, under_roof
+from fleetmap.simulation.roads import LANE_M
 from fleetmap.simulation.surfaces import SurfaceBuilder, Surfaces, brightness_in, normals_of
 from fleetmap.simulation.vehicles import park_car
 
@@ -83,6 +84,7 @@ class Traffic:
     car_numbers: NDArray[np.int64]  # (Q,) of each surface
     normals_in_car: Array  # (Q, 3)
     sun_in_map: Array  # (3,)
+    tunnels_m: tuple[tuple[float, float], ...]
 
     def surfaces_at(self, seconds: float) -> Surfaces:
         """All moving cars, in the map frame."""
@@ -96,6 +98,7 @@ class Traffic:
         rotations = np.stack([np.cross(left_in_map, up), left_in_map, up], axis=2)[self.car_numbers]
         normals = np.einsum("qij,qj->qi", rotations, self.normals_in_car)
         brightness = brightness_in(self.sun_in_map, normals, self.cars.two_sided)
+        brightness *= under_roof(s, self.tunnels_m)[self.car_numbers]
         return self.cars.posed(rotations, self.line.at(s, left)[self.car_numbers], brightness)
 
 
@@ -110,7 +113,7 @@ def send_traffic(
     cars_per_km: float,
     own_lane_m: float,
     own_speed_mps: float,
-    lane_m: float = 3.5,
+    tunnels_m: tuple[tuple[float, float], ...] = (),
 ) -> Traffic | None:
     """Cars that come towards the recording vehicle in the other lane, and one that drives ahead of it.
 
@@ -121,7 +124,7 @@ def send_traffic(
     if cars_per_km <= 0.0:
         return None
     own = _measure_lane(line, stretch_m, own_lane_m, is_closed)
-    other = _measure_lane(line, stretch_m, lane_m if own_lane_m <= lane_m / 2.0 else 0.0, is_closed)
+    other = _measure_lane(line, stretch_m, LANE_M if own_lane_m <= LANE_M / 2.0 else 0.0, is_closed)
     ahead_m = float(np.interp(cars_per_km, [0.0, 60.0], [24.0, 8.5]))
     begin = float(np.interp(0.0, own.s_m, own.travelled_m))
     places = (np.arange(oncoming) + rng.uniform(0.1, 0.9, oncoming)) * other.travelled_m[-1] / max(oncoming, 1)
@@ -144,6 +147,7 @@ def send_traffic(
         np.array(owners),
         normals_of(cars.corners_in_map),
         builder.sun_in_map,
+        tunnels_m,
     )
 
 

@@ -17,14 +17,16 @@ from fleetmap.errors import InputError
 from fleetmap.geodesy import UtmAnchor
 from fleetmap.simulation import traffic
 from fleetmap.simulation.atlas import Atlas, build_atlas
-from fleetmap.simulation.blocks import SHORTEST_CIRCUIT_M, Kerb, build_blocks, plan_circuit
-from fleetmap.simulation.ground import StreetGrid, lay_far_ground
+from fleetmap.simulation.blocks import SHORTEST_CIRCUIT_M, lay_city, lay_facades
+from fleetmap.simulation.country import lay_straight, lay_tunnel
+from fleetmap.simulation.ground import lay_far_ground
 from fleetmap.simulation.horizon import raise_horizon
 from fleetmap.simulation.markers import Marker, set_up_markers
 from fleetmap.simulation.palette import Palette
 from fleetmap.simulation.path import Line
-from fleetmap.simulation.relief import Terrain, shape_profile
-from fleetmap.simulation.roads import RoadPath, closed_path
+from fleetmap.simulation.plot import Plot
+from fleetmap.simulation.roads import RoadPath
+from fleetmap.simulation.square import lay_open
 from fleetmap.simulation.street import anchor_at, build_street
 from fleetmap.simulation.surfaces import SurfaceBuilder, Surfaces
 from fleetmap.simulation.traffic import Traffic
@@ -88,16 +90,6 @@ class World:
         return Scene(self.scene.surfaces.joined(self.traffic.surfaces_at(seconds)), self.scene.atlas)
 
 
-@dataclass(frozen=True)
-class Plot:
-    """What a kind of world lays out before cars, markers and the horizon come to it."""
-
-    path: RoadPath
-    kerbs: list[Kerb]
-    marker_places: list[tuple[float, float]]  # (s, left) along the path
-    tunnels_m: tuple[tuple[float, float], ...] = ()
-
-
 def build_world(
     seed: int,
     *,
@@ -147,7 +139,7 @@ def build_world(
     builder = SurfaceBuilder(_towards_sun(drive_rng, sun_deg))
     palette = Palette(seed, builder)
     plot = _LAYOUTS[kind](plan_rng, builder, palette, length_m)
-    markers = set_up_markers(builder, palette, plot.path, plot.marker_places)
+    markers = set_up_markers(builder, palette, plot)
     lay_horizon(far_rng, builder, plot.path)
     traffic.park_cars(builder, palette, plot.kerbs, seed, drive_seed, parked_cars_changed)
     moving = traffic.send_traffic(
@@ -160,6 +152,7 @@ def build_world(
         cars_per_km=moving_cars_per_km,
         own_lane_m=own_lane_m,
         own_speed_mps=own_speed_mps,
+        tunnels_m=plot.tunnels_m,
     )
     scene = Scene(builder.surfaces(), build_atlas(builder.textures))
     path = plot.path
@@ -183,40 +176,10 @@ def lay_horizon(rng: Rng, builder: SurfaceBuilder, path: RoadPath) -> None:
     raise_horizon(rng, builder, centre, radius, pictures=6)
 
 
-def _city(rng: Rng, builder: SurfaceBuilder, palette: Palette, length_m: float, *, alike: bool = False) -> Plot:
-    path, grid = _circuit(rng, length_m)
-    kerbs = build_blocks(rng, builder, palette, path, grid, alike=alike)
-    return Plot(path, kerbs, _along_straights(path, 45.0, (-5.3, 8.8)))
-
-
-def _facades(rng: Rng, builder: SurfaceBuilder, palette: Palette, length_m: float) -> Plot:
-    return _city(rng, builder, palette, length_m, alike=True)
-
-
-def _circuit(rng: Rng, length_m: float) -> tuple[RoadPath, StreetGrid]:
-    grid, corners = plan_circuit(rng, length_m)
-    profiles = [
-        shape_profile(rng, axes[:, None] + np.array([-22.0, 22.0]) * 0.4, 0.04, 0.08, 60.0)
-        for axes in (grid.columns_m, grid.rows_m)
-    ]
-    heading = float(rng.uniform(-np.pi, np.pi))
-    origin = np.zeros(3)
-    path = closed_path(Terrain(heading, origin, profiles[0], profiles[1]), corners)
-    terrain = Terrain(heading, -path.at(0.0), profiles[0], profiles[1])
-    return closed_path(terrain, corners), grid
-
-
-def _along_straights(path: RoadPath, every_m: float, lefts_m: tuple[float, float]) -> list[tuple[float, float]]:
-    """Places (s, left) on alternate sides, where the path is straight."""
-    s = np.arange(14.0, path.length_m - 5.0, every_m)
-    straight = np.abs(path.heading_rad(s + 12.0) - path.heading_rad(s - 12.0)) < 1e-3
-    return [(float(place), lefts_m[i % 2]) for i, place in enumerate(s[straight])]
-
-
 _LAYOUTS: dict[str, Callable[[Rng, SurfaceBuilder, Palette, float], Plot]] = {
-    "city": _city,
-    "facades": _facades,
-    "straight": _city,
-    "tunnel": _city,
-    "open": _city,
+    "city": lay_city,
+    "facades": lay_facades,
+    "straight": lay_straight,
+    "tunnel": lay_tunnel,
+    "open": lay_open,
 }
