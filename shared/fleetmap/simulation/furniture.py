@@ -107,9 +107,18 @@ def place_furniture(
         if kind < 0.35:
             builder.add_box(foot, heading, (0.14, 0.14, 6.2), paint.metal)
             builder.add_box(raised(foot, 6.2), heading, (0.9, 0.3, 0.15), paint.metal)
+            _hang_lamp(builder, raised(foot, 6.19), heading, paint.metal)
         elif kind < 0.7:
             builder.add_box(foot, heading, (0.07, 0.07, 3.0), paint.metal)
             builder.add_box(raised(foot, 2.2), heading, (0.03, 0.7, 0.7), int(rng.choice(paint.signs)))
         else:
             size = (float(rng.uniform(0.5, 1.1)), float(rng.uniform(0.4, 0.6)), float(rng.uniform(0.8, 1.3)))
             builder.add_box(foot, heading, size, int(rng.choice(paint.boxes)))
+
+
+def _hang_lamp(builder: SurfaceBuilder, middle: Array, heading_rad: float, texture: int) -> None:
+    """The lamp itself: a plate that faces the street from above."""
+    along = 0.42 * np.array([np.cos(heading_rad), np.sin(heading_rad), 0.0])
+    left = 0.13 * np.array([-np.sin(heading_rad), np.cos(heading_rad), 0.0])
+    corners = middle + np.stack([along + left, -along + left, -along - left, along - left])
+    builder.add_quad(corners, texture, is_lamp=True)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from fleetmap.errors import InputError
 from fleetmap.geometry import Pose
 
+Array = NDArray[np.float64]
 FloatImage = NDArray[np.float32]
 
 _METER_EVERY_PX = 6
@@ -34,7 +35,7 @@ class Look:
     daylight: float = 1.0  # factor on the light that falls on everything, and on the sky's own
     sky: float = 1.0  # factor on the sky's own light, on top of daylight
     sun_contrast: float = 1.0  # 1: sunlit and shaded sides as built; 0: light from everywhere, no shaded side
-    lamps: float = 1.0  # factor on the light of lamps, which no daylight dims
+    lamps: float = 0.0  # how bright lamps burn: the light of a white lamp, as a share of a white wall's in the sun
     wetness: float = 0.0  # of the ground, 0..1: darker, and it mirrors what stands above it
 
     def apply(self, light: FloatImage, map_from_cam: Pose) -> NDArray[np.uint8]:
@@ -55,12 +56,12 @@ class Look:
         image *= np.float32(255.0)
         return np.asarray(cv2.convertScaleAbs(np.maximum(image, np.float32(0.0))), dtype=np.uint8)
 
-    def surface_light(self, brightness: NDArray[np.float64]) -> NDArray[np.float64]:
+    def surface_light(self, brightness: Array, is_lamp: NDArray[np.bool_]) -> Array:
         """Brightness (Q,) of surfaces under the sun they were built in, as it is in this look's light."""
         if self.sun_contrast != 1.0:
             relative = np.maximum(brightness, 0.0) / _MEAN_BRIGHTNESS
             brightness = _MEAN_BRIGHTNESS * relative**self.sun_contrast
-        return np.asarray(brightness * self.daylight)
+        return np.maximum(brightness * self.daylight, np.where(is_lamp, self.lamps, 0.0))
 
     def _tone(self, light: FloatImage, exposure: float) -> FloatImage:
         """Share of full white (...), before noise."""

@@ -16,8 +16,9 @@ from fleetmap.simulation.look import Look
 from fleetmap.simulation.planes import planes_in_cam, surfaces_in_cone
 from fleetmap.simulation.rays import BAND_ROWS, first_sample, ray_table
 from fleetmap.simulation.shading import SKY_GREY, Paint, shade
-from fleetmap.simulation.view import Scene, view_of
+from fleetmap.simulation.view import Scene, View, view_of
 from fleetmap.simulation.visibility import NOTHING, first_hits
+from fleetmap.simulation.wetness import mirrored_camera, road_plane, wet_the_ground
 
 Array = NDArray[np.float64]
 FloatImage = NDArray[np.float32]
@@ -105,19 +106,32 @@ def surface_ids(scene: Scene, camera: Camera, map_from_cam: Pose) -> NDArray[np.
 
 
 def _light(scene: Scene, camera: Camera, poses: list[Pose], look: Look) -> FloatImage:
-    """The light (H, W) that falls on the sensor, of 255 where a white wall is as bright as the exposure allows."""
-    view = view_of(scene, ray_table(camera), poses, _SAMPLES_PX)
-    light = np.empty((camera.height_px, camera.width_px), dtype=np.float32)
-    shade(view.planes, _paint(scene, view.ids, look), view.table, view.samples_px, view.seen, light)
+    """The light (H, W) that falls on the sensor; 255 is what saturates it at an exposure of 1."""
+    view, light = _dry_light(scene, camera, poses, look)
+    if look.wetness > 0.0:
+        pose = poses[len(poses) // 2]
+        from_here = Pose(np.eye(3), pose.translation_m)
+        plane = road_plane(lambda rays_in_map: cast_rays(scene, from_here, rays_in_map), pose)
+        if plane is not None:
+            coarse_camera, mirrored_pose = mirrored_camera(camera, pose, plane)
+            _, mirror = _dry_light(scene, coarse_camera, [mirrored_pose], look)
+            wet_the_ground(light, mirror, look.wetness, scene.surfaces, view, pose, plane)
     return light
 
 
+def _dry_light(scene: Scene, camera: Camera, poses: list[Pose], look: Look) -> tuple[View, FloatImage]:
+    view = view_of(scene, ray_table(camera), poses, _SAMPLES_PX)
+    light = np.empty((camera.height_px, camera.width_px), dtype=np.float32)
+    shade(view.planes, _paint(scene, view.ids, look), view.table, view.samples_px, view.seen, light)
+    return view, light
+
+
 def _paint(scene: Scene, ids: NDArray[np.int64], look: Look) -> Paint:
-    textures = scene.surfaces.texture_indices[ids]
+    surfaces, textures = scene.surfaces, scene.surfaces.texture_indices[ids]
     return Paint(
         scene.atlas.pixels,
         scene.atlas.origins_px[textures],
         scene.atlas.sizes_px[textures],
-        look.surface_light(scene.surfaces.brightness[ids]).astype(np.float32),
+        look.surface_light(surfaces.brightness[ids], surfaces.is_lamp[ids]).astype(np.float32),
         np.float32(SKY_GREY * look.daylight * look.sky),
     )

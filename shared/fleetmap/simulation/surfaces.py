@@ -8,7 +8,6 @@ so whatever sees the world (a camera now, a range sensor another day) needs to k
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,62 +34,25 @@ class Surfaces:
     texture_indices: NDArray[np.int64]  # (Q,) int64
     brightness: Array  # (Q,) float64, factor on the texture's grey: how the light falls
     two_sided: NDArray[np.bool_]  # (Q,) bool; the others are seen only from where the corners run clockwise
+    is_lamp: NDArray[np.bool_]  # (Q,) bool: burns when it gets dark
 
     def __len__(self) -> int:
         return len(self.texture_indices)
 
-    @cached_property
-    def map_from_texture(self) -> Array:
-        """(Q, 3, 3): takes texture coordinates (s, t, 1), each in [0, 1], to map points times a weight.
-
-        The third row of :attr:`weights` times (s, t, 1) is that weight. From the corner correspondences; the
-        general case is in P. Heckbert, "Fundamentals of Texture Mapping and Image Warping", 1989, section 2.2.3.
-        """
-        top_left, right_axis, down_axis = self._axes()
-        basis = np.stack([right_axis, down_axis, top_left], axis=2)
-        return np.asarray(basis @ self.weights)
-
-    @cached_property
-    def weights(self) -> Array:
-        """(Q, 3, 3): takes (s, t, 1) to homogeneous coordinates along the top and left edge."""
-        top_left, right_axis, down_axis = self._axes()
-        axes = np.stack([right_axis, down_axis], axis=2)
-        diagonal = (self.corners_in_map[:, 2] - top_left)[:, :, None]
-        along = (np.linalg.pinv(axes) @ diagonal)[:, :, 0]
-        along = along / (along.sum(axis=1, keepdims=True) - 1.0)
-        weights = np.zeros((len(self), 3, 3))
-        weights[:, 0, 0], weights[:, 1, 1], weights[:, 2, 2] = along[:, 0], along[:, 1], 1.0
-        weights[:, 2, 0], weights[:, 2, 1] = along[:, 0] - 1.0, along[:, 1] - 1.0
-        return weights
-
     def posed(self, rotations: Array, translations_m: Array, brightness: Array) -> Surfaces:
-        """Each surface turned by its (Q, 3, 3) and moved by its (Q, 3), in a new light (Q,).
-
-        Turning and moving leave :attr:`weights` as they are, so that the matrices need no second solution.
-        """
+        """Each surface turned by its (Q, 3, 3) and moved by its (Q, 3), in a new light (Q,)."""
         corners = self.corners_in_map @ rotations.transpose(0, 2, 1) + translations_m[:, None]
-        moved = Surfaces(corners, self.texture_indices, brightness, self.two_sided)
-        texture = rotations @ self.map_from_texture + translations_m[:, :, None] * self.weights[:, 2:3]
-        return moved._with_matrices(texture, self.weights)
+        return Surfaces(corners, self.texture_indices, brightness, self.two_sided, self.is_lamp)
 
     def joined(self, other: Surfaces) -> Surfaces:
-        """These surfaces and then the others; nothing is solved again."""
-        both = Surfaces(
+        """These surfaces and then the others."""
+        return Surfaces(
             np.concatenate([self.corners_in_map, other.corners_in_map]),
             np.concatenate([self.texture_indices, other.texture_indices]),
             np.concatenate([self.brightness, other.brightness]),
             np.concatenate([self.two_sided, other.two_sided]),
+            np.concatenate([self.is_lamp, other.is_lamp]),
         )
-        texture = np.concatenate([self.map_from_texture, other.map_from_texture])
-        return both._with_matrices(texture, np.concatenate([self.weights, other.weights]))
-
-    def _with_matrices(self, map_from_texture: Array, weights: Array) -> Surfaces:
-        self.__dict__.update(map_from_texture=map_from_texture, weights=weights)  # where the cached ones live
-        return self
-
-    def _axes(self) -> tuple[Array, Array, Array]:
-        top_left = self.corners_in_map[:, 0]
-        return top_left, self.corners_in_map[:, 1] - top_left, self.corners_in_map[:, 3] - top_left
 
 
 def brightness_in(sun_in_map: Array, normals_in_map: Array, two_sided: NDArray[np.bool_]) -> Array:
@@ -110,6 +72,7 @@ class SurfaceBuilder:
     _shade: list[float] = field(default_factory=list)
     _lit: list[bool] = field(default_factory=list)
     _two_sided: list[bool] = field(default_factory=list)
+    _is_lamp: list[bool] = field(default_factory=list)
 
     def add_texture(self, grey: GreyImage, opacity: GreyImage | None = None) -> int:
         """Keep a texture; the number returned names it."""
@@ -119,7 +82,14 @@ class SurfaceBuilder:
         return len(self.textures) - 1
 
     def add_quad(
-        self, corners_in_map: Array, texture: int, *, two_sided: bool = False, lit: bool = True, shade: float = 1.0
+        self,
+        corners_in_map: Array,
+        texture: int,
+        *,
+        two_sided: bool = False,
+        lit: bool = True,
+        shade: float = 1.0,
+        is_lamp: bool = False,
     ) -> None:
         """Add a flat surface; corners (4, 3) clockwise from top left, as seen from its front."""
         self._corners.append(np.asarray(corners_in_map, dtype=np.float64))
@@ -127,6 +97,7 @@ class SurfaceBuilder:
         self._shade.append(shade)
         self._lit.append(lit)
         self._two_sided.append(two_sided)
+        self._is_lamp.append(is_lamp)
 
     def add_prism(
         self, bottom: Array, top: Array, sides: tuple[int, int, int, int], lid: int, *, shade: float = 1.0
@@ -160,7 +131,8 @@ class SurfaceBuilder:
             crooked = corners[int(np.argmax(warp))].tolist()
             raise ValueError(f"the four corners of a surface do not lie in one plane: {crooked}")
         light = np.where(self._lit, brightness_in(self.sun_in_map, normals, two_sided), 1.0)
-        return Surfaces(corners, np.array(self._texture_indices, dtype=np.int64), shade * light, two_sided)
+        textures = np.array(self._texture_indices, dtype=np.int64)
+        return Surfaces(corners, textures, shade * light, two_sided, np.array(self._is_lamp))
 
 
 def normals_of(corners: Array) -> Array:

@@ -128,4 +128,6 @@ def _hang_lamp(builder: SurfaceBuilder, palette: Palette, terrain: Terrain, u: f
         along = terrain.at(u + 0.7, v) - terrain.at(u - 0.7, v)
         across = terrain.at(u, v + 0.15) - terrain.at(u, v - 0.15)
         half = [(-0.5, 0.5), (0.5, 0.5), (0.5, -0.5), (-0.5, -0.5)]
-        builder.add_quad(np.stack([middle + a * along + b * across for a, b in half])[::-1], glow, lit=False)
+        builder.add_quad(
+            np.stack([middle + a * along + b * across for a, b in half])[::-1], glow, lit=False, is_lamp=True
+        )
