@@ -11,6 +11,8 @@ import cv2
 import numpy as np
 import pytest
 from mcap.writer import CompressionType, IndexType, Writer
+from mcap_protobuf.schema import build_file_descriptor_set
+from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 from rosbags.rosbag2.enums import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.typesys import Stores, get_typestore
@@ -73,6 +75,55 @@ class ForeignRecorder:
             self._channels[topic] = self._mcap.register_channel(topic, encoding, schema_id)
         self._mcap.add_message(self._channels[topic], stamp_ns, data, stamp_ns)
 
+    def protobuf(self, topic: str, message: Any, stamp_ns: int, *, data: bytes | None = None) -> None:
+        """A protobuf message beside the others, as Foxglove's tools write it."""
+        if topic not in self._channels:
+            descriptors = build_file_descriptor_set(type(message)).SerializeToString()
+            schema_id = self._mcap.register_schema(message.DESCRIPTOR.full_name, "protobuf", descriptors)
+            self._channels[topic] = self._mcap.register_channel(topic, "protobuf", schema_id)
+        data = message.SerializeToString() if data is None else data
+        self._mcap.add_message(self._channels[topic], stamp_ns, data, stamp_ns)
+
+    def other(self, topic: str, type_name: str, encoding: str, schema: tuple[str, bytes], data: bytes) -> None:
+        """A message in any encoding at all."""
+        if topic not in self._channels:
+            schema_id = self._mcap.register_schema(type_name, *schema) if type_name else 0
+            self._channels[topic] = self._mcap.register_channel(topic, encoding, schema_id)
+        self._mcap.add_message(self._channels[topic], T0_NS, data, T0_NS)
+
+    def imu(
+        self, topic: str, stamp_ns: int, angular: tuple[float, ...], linear: tuple[float, ...], **options: Any
+    ) -> None:
+        vector = TYPES.types["geometry_msgs/msg/Vector3"]
+        unknown = np.zeros(9)
+        message = TYPES.types["sensor_msgs/msg/Imu"](
+            header(stamp_ns, "imu"),
+            TYPES.types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
+            unknown,
+            vector(*angular),
+            options.get("angular_covariance", unknown),
+            vector(*linear),
+            unknown,
+        )
+        self.write(topic, message, options.get("log_ns", stamp_ns))
+
+    def twist(self, topic: str, stamp_ns: int, forward_mps: float, frame_id: str = "base_link") -> None:
+        message = TYPES.types["geometry_msgs/msg/TwistStamped"](header(stamp_ns, frame_id), _twist(forward_mps))
+        self.write(topic, message, stamp_ns)
+
+    def odometry(self, topic: str, stamp_ns: int, forward_mps: float) -> None:
+        geometry = "geometry_msgs/msg/"
+        pose = TYPES.types[geometry + "Pose"](
+            TYPES.types[geometry + "Point"](7.0, 8.0, 9.0), TYPES.types[geometry + "Quaternion"](0.0, 0.0, 0.0, 1.0)
+        )
+        message = TYPES.types["nav_msgs/msg/Odometry"](
+            header(stamp_ns, "odom"),
+            "base_link",
+            TYPES.types[geometry + "PoseWithCovariance"](pose, np.zeros(36)),
+            TYPES.types[geometry + "TwistWithCovariance"](_twist(forward_mps), np.zeros(36)),
+        )
+        self.write(topic, message, stamp_ns)
+
     def jpeg(self, topic: str, stamp_ns: int, image: np.ndarray, frame_id: str, **write: Any) -> None:
         self.compressed(topic, stamp_ns, cv2.imencode(".jpg", image)[1].tobytes(), "jpeg", frame_id, **write)
 
@@ -103,8 +154,11 @@ class ForeignRecorder:
         d: tuple[float, ...] | None = None,
         k: np.ndarray | None = None,
         p: np.ndarray | None = None,
+        binning: tuple[int, int] = (0, 0),
+        region: tuple[int, int, int, int] = (0, 0, 0, 0),
     ) -> None:
-        region = TYPES.types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
+        """``region``: x, y, height, width."""
+        roi = TYPES.types["sensor_msgs/msg/RegionOfInterest"](*region, False)
         k = camera.matrix if k is None else k
         message = TYPES.types["sensor_msgs/msg/CameraInfo"](
             header(stamp_ns, frame_id),
@@ -115,9 +169,8 @@ class ForeignRecorder:
             k.reshape(9),
             np.eye(3).reshape(9),
             (np.hstack([k, np.zeros((3, 1))]) if p is None else p).reshape(12),
-            0,
-            0,
-            region,
+            *binning,
+            roi,
         )
         self.write(topic, message, stamp_ns)
 
@@ -163,6 +216,11 @@ class ForeignRecorder:
         self.write(topic, TYPES.types["tf2_msgs/msg/TFMessage"](stamped), stamp_ns)
 
 
+def _twist(forward_mps: float) -> Any:
+    vector = TYPES.types["geometry_msgs/msg/Vector3"]
+    return TYPES.types["geometry_msgs/msg/Twist"](vector(forward_mps, 55.0, 66.0), vector(0.1, 0.2, 0.3))
+
+
 def header(stamp_ns: int, frame_id: str) -> Any:
     time = TYPES.types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, 1_000_000_000))
     return TYPES.types["std_msgs/msg/Header"](time, frame_id)
@@ -206,6 +264,26 @@ def street(record: Callable[..., ForeignRecorder], small_camera: Camera, picture
         return Path(recorder.path)
 
     return build
+
+
+@pytest.fixture(scope="session")
+def read_by_rosbags() -> Callable[[Path], dict[str, list[Any]]]:
+    """What rosbags' AnyReader reads of a recording, by topic in the order of log times."""
+
+    def read(path: Path) -> dict[str, list[Any]]:
+        with AnyReader([path]) as reader:
+            messages: dict[str, list[Any]] = {topic: [] for topic in reader.topics}
+            for connection, log_time_ns, raw in reader.messages():
+                message = reader.deserialize(raw, connection.msgtype)
+                messages[connection.topic].append(message)
+                assert not hasattr(message, "header") or stamp_of(message) == log_time_ns
+        return messages
+
+    return read
+
+
+def stamp_of(message: Any) -> int:
+    return int(message.header.stamp.sec) * 1_000_000_000 + int(message.header.stamp.nanosec)
 
 
 KINDS_OF_FILE = {
