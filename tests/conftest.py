@@ -20,6 +20,7 @@ from fleetmap.drives.ros2_writer import DriveWriter
 from fleetmap.geometry import rotation_angle_rad
 from fleetmap.simulation.driving import drive_along
 from fleetmap.simulation.recording import record_drive
+from fleetmap.simulation.simulated_drive import simulate_drive
 from fleetmap.simulation.street import Street, build_street
 from fleetmap.trajectory import Trajectory
 from fleetmap_cli.main import main
@@ -75,8 +76,8 @@ def survey(tmp_path_factory: pytest.TempPathFactory) -> Survey:
     camera = Camera(640, 320, 430.0, 430.0, 319.5, 159.5)
     truth = drive_along(street, seed=2)
     recording = tmp_path_factory.mktemp("survey") / "survey.mcap"
-    reference = record_drive(street, recording, camera=camera, trajectory=truth, gnss_interval_s=1.0, seed=2)
-    return Survey(street, recording, reference, truth)
+    drive = simulate_drive(street, camera=camera, trajectory=truth, gnss_interval_s=1.0, seed=2)
+    return Survey(street, recording, record_drive(drive, recording).reference, truth)
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ from fleetmap.files import atomic_path
 from fleetmap.simulation.driving import START_NS, drive_along
 from fleetmap.simulation.look import Look
 from fleetmap.simulation.recording import record_drive
+from fleetmap.simulation.simulated_drive import simulate_drive
 from fleetmap.simulation.street import build_street
 from fleetmap_cli.demo_picture import draw_demonstration
 from fleetmap_cli.demo_processes import interrupted_once, run_verb, running_map_server
@@ -128,12 +129,8 @@ def _record_drives(folder: Path, seed: int, length_m: float) -> None:
     interval_s = min(GNSS_INTERVAL_S, drive_s / FEWEST_INTERVALS)
     click.echo(f"survey.mcap: {_described(SURVEY_CAMERA)}; one RTK fix every {interval_s:.1f} s, 5 cm noise")
     record_drive(
-        street,
+        simulate_drive(street, camera=SURVEY_CAMERA, trajectory=survey, gnss_interval_s=interval_s, seed=seed),
         folder / "survey.mcap",
-        camera=SURVEY_CAMERA,
-        trajectory=survey,
-        gnss_interval_s=interval_s,
-        seed=seed,
         progress=True,
     )
     second = drive_along(
@@ -148,13 +145,8 @@ def _record_drives(folder: Path, seed: int, length_m: float) -> None:
         "another day, no GNSS"
     )
     record_drive(
-        street,
+        simulate_drive(street, camera=SECOND_CAMERA, trajectory=second, look=SECOND_LOOK, gnss=None, seed=seed),
         folder / "second.mcap",
-        camera=SECOND_CAMERA,
-        trajectory=second,
-        look=SECOND_LOOK,
-        gnss=None,
-        seed=seed,
         progress=True,
     )
 

@@ -25,7 +25,7 @@ from fleetmap.drives.ros2_writer import DriveWriter
 from fleetmap.geodesy import UtmGrid
 from fleetmap.simulation.driving import drive_along
 from fleetmap.simulation.look import Look
-from fleetmap.simulation.recording import simulate_drive
+from fleetmap.simulation.simulated_drive import simulate_drive
 from fleetmap.trajectory import read_trajectory, write_trajectory
 
 FLEETMAP = [sys.executable, "-c", "from fleetmap_cli.main import main; main()"]

@@ -11,8 +11,8 @@ from fleetmap.camera import Camera
 from fleetmap.geometry import Pose, rotation_angle_rad, so3_exp
 from fleetmap.simulation.driving import drive_along
 from fleetmap.simulation.look import Look
-from fleetmap.simulation.recording import simulate_drive
 from fleetmap.simulation.rendering import render
+from fleetmap.simulation.simulated_drive import simulate_drive
 from fleetmap.simulation.street import build_street
 from fleetmap.vision.features import FeatureExtractor, FeatureSettings
 from fleetmap_mapper.initialisation import TwoViewMap, map_from_two_views, match_two_views

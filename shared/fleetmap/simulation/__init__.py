@@ -1,5 +1,6 @@
-"""A street built in numpy and OpenCV, with the truth known.
+"""Worlds built in numpy and OpenCV, and what a vehicle's sensors record in them, with the truth known.
 
-``street.build_street`` -> ``driving.drive_along`` -> ``recording.record_drive`` (a file) or ``simulate_drive`` (in
-memory); ``rendering`` says what any camera sees from any pose, and which point of the street is behind a pixel.
+``world.build_world`` or ``street.build_street`` -> ``driving.plan_motion`` -> ``simulated_drive.simulate_drive`` (in
+memory) -> ``recording.record_drive`` (a file); ``rendering`` says what any camera or range sensor sees from any pose,
+and which point of the world is behind a pixel.
 """

@@ -125,16 +125,17 @@ def plan_motion(
         )
     line = _Line(road.path, lane_offset_m, start_m, stop_m)
     grid_speed = speed_mps * grid_scale_at(road.anchor)
-    seconds, s = _timetable(line, start_m, stop_m, grid_speed, slow_in_bends)
+    seconds, s, lengths_m = _timetable(line, start_m, stop_m, grid_speed, slow_in_bends)
     knots_s = _KNOT_S * np.arange(-round(_MARGIN_S / _KNOT_S), np.ceil((seconds[-1] + _MARGIN_S) / _KNOT_S) + 1.0)
     rng = np.random.default_rng(seed)
     left = _WEAVE_M * _sway(rng, knots_s, _FREQUENCIES_HZ[0] / 2.0)
     height = camera_height_m + _BOUNCE_M * _sway(rng, knots_s, _FREQUENCIES_HZ[1])
     wobble = np.stack([a * _sway(rng, knots_s, _FREQUENCIES_HZ[1]) for a in _WOBBLE_RAD], axis=1)
-    s_knots = _beyond_the_ends(knots_s, seconds, s)
+    s_knots, lengths_knots_m = (_beyond_the_ends(knots_s, seconds, at_m) for at_m in (s, lengths_m))
     positions_m = line.beside(s_knots, left, height)
     rotations = line.looking_along(s_knots) @ so3_exp(wobble)
-    return motion_through(road.anchor, start_ns, knots_s, rotations, positions_m, float(seconds[-1]))
+    pace_s = (_lane_length_m(road.path, lane_offset_m, start_m) + lengths_knots_m) / grid_speed
+    return motion_through(road.anchor, start_ns, knots_s, rotations, positions_m, float(seconds[-1]), pace_s)
 
 
 class _Line:
@@ -172,10 +173,17 @@ class _Line:
         return np.asarray(np.abs(across) / np.hypot(first[:, 0], first[:, 1]) ** 3)
 
 
+def _lane_length_m(path: Path, lane_offset_m: float, start_m: float) -> float:
+    """How long a lane is from s = 0 to where a drive starts; negative for a start before it."""
+    s = np.linspace(0.0, start_m, max(2, int(np.ceil(abs(start_m) / _STEP_M)) + 1))
+    steps = np.linalg.norm(np.diff(path.at(s, lane_offset_m), axis=0), axis=1)
+    return float(np.copysign(steps.sum(), start_m))
+
+
 def _timetable(
     line: _Line, start_m: float, stop_m: float, speed_mps: float, slow_in_bends: bool
-) -> tuple[Array, Array]:
-    """When (N,) the car is where (N,) along the path."""
+) -> tuple[Array, Array, Array]:
+    """When (N,) the car is where (N,) along the path, and how far (N,) it has come along its lane."""
     step_m = 0.25
     s = np.linspace(start_m, stop_m, max(2, int(np.ceil((stop_m - start_m) / step_m)) + 1))
     lengths_m = line.lengths_m(s)
@@ -187,7 +195,7 @@ def _timetable(
         speeds = _reachable(speeds[::-1], lengths_m[-1] - lengths_m[::-1], _BRAKING_M_S2)[::-1]
         speeds = gaussian_filter1d(speeds, 2.0 / step_m, mode="nearest")  # no jerk
     pauses = np.diff(lengths_m) * 2.0 / (speeds[1:] + speeds[:-1])
-    return np.concatenate([[0.0], np.cumsum(pauses)]), s
+    return np.concatenate([[0.0], np.cumsum(pauses)]), s, lengths_m
 
 
 def _reachable(speeds_mps: Array, lengths_m: Array, limit_m_s2: float) -> Array:
@@ -198,7 +206,7 @@ def _reachable(speeds_mps: Array, lengths_m: Array, limit_m_s2: float) -> Array:
 
 
 def _beyond_the_ends(knots_s: Array, seconds: Array, s: Array) -> Array:
-    """Places (N,) along the path at some moments; before and after the drive, on at the same speed."""
+    """Places (N,) at some moments, of those (K,) that are known; before and after, on at the same speed."""
     first, last = (s[1] - s[0]) / (seconds[1] - seconds[0]), (s[-1] - s[-2]) / (seconds[-1] - seconds[-2])
     inside = CubicSpline(seconds, s)(np.clip(knots_s, seconds[0], seconds[-1]))
     return np.asarray(inside + first * np.minimum(knots_s, 0.0) + last * np.maximum(knots_s - seconds[-1], 0.0))

@@ -45,6 +45,11 @@ class Motion:
     grid_scale: float  # grid metres per metre on the ground
     positions: CubicSpline  # of seconds: (3,) camera centre in map
     rotations: RotationSpline  # of seconds: map_from_cam
+    pace: CubicSpline | None = None  # of seconds: when the vehicle would be there had it kept its speed from s = 0
+
+    def traffic_s(self, seconds: float) -> float:
+        """What a clock of the traffic shows: it slows down with the vehicle, so that nobody runs into it."""
+        return seconds if self.pace is None else float(self.pace(seconds))
 
     def map_from_cam(self, seconds: float) -> Pose:
         """The camera's pose at one moment."""
@@ -88,7 +93,13 @@ class Motion:
 
 
 def motion_through(
-    anchor: UtmAnchor, start_ns: int, seconds: Array, rotations: Array, positions_m: Array, duration_s: float
+    anchor: UtmAnchor,
+    start_ns: int,
+    seconds: Array,
+    rotations: Array,
+    positions_m: Array,
+    duration_s: float,
+    pace_s: Array | None = None,
 ) -> Motion:
     """The smooth motion through poses ``map_from_cam`` (N, 3, 3), (N, 3) at increasing moments (N,).
 
@@ -98,7 +109,9 @@ def motion_through(
     if len(seconds) < 2:
         raise InputError(f"a motion needs at least 2 poses, got {len(seconds)}")
     spline = RotationSpline(seconds, Rotation.from_matrix(rotations))
-    return Motion(anchor, start_ns, duration_s, grid_scale_at(anchor), CubicSpline(seconds, positions_m), spline)
+    pace = None if pace_s is None else CubicSpline(seconds, pace_s)
+    scale = grid_scale_at(anchor)
+    return Motion(anchor, start_ns, duration_s, scale, CubicSpline(seconds, positions_m), spline, pace)
 
 
 def motion_of(anchor: UtmAnchor, trajectory: Trajectory) -> Motion:

@@ -1,177 +1,188 @@
-"""Simulated drives: in memory for those who map and localise, or written as a recording with its reference."""
+"""Simulated drives as recordings, with the truth beside them and never inside."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+import heapq
+import json
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from tqdm import tqdm
 
-from fleetmap.camera import Camera
-from fleetmap.drive import Antenna, Frame, GnssFix, ImuSample, WheelSpeed
+from fleetmap.drives.image_codec import encode_image
 from fleetmap.drives.ros2_writer import DriveWriter
-from fleetmap.errors import InputError
-from fleetmap.geometry import Pose
-from fleetmap.gnss import GNSS_ERROR_MODELS, sample_fixes
-from fleetmap.simulation.look import Look
-from fleetmap.simulation.rendering import render
-from fleetmap.simulation.street import Street
-from fleetmap.trajectory import Trajectory, write_trajectory
+from fleetmap.files import atomic_path, refuse_existing, write_text_atomically
+from fleetmap.geometry import quat_xyzw_from_rotations
+from fleetmap.simulation.mounting import ANTENNA_FRAME, CAMERA_FRAME, IMU_FRAME, LIDAR_FRAME, VEHICLE_FRAME
+from fleetmap.simulation.parallel import render_many
+from fleetmap.simulation.simulated_drive import SimulatedDrive
+from fleetmap.simulation.world import World
+from fleetmap.trajectory import write_trajectory
 
-_CAMERA_FRAME_ID, _ANTENNA_FRAME_ID = "camera", "gnss"
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class SimulatedDrive:
-    """A drive through a street, as ``fleetmap.drive.Drive``; its images are rendered when they are asked for."""
+class Recorded:
+    """What recording a drive has written."""
 
-    street: Street
-    camera: Camera
-    trajectory: Trajectory  # the truth, one pose per image
-    look: Look = field(default_factory=Look)
-    fixes: tuple[GnssFix, ...] = ()
-    antenna_in_cam_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    name: str = "simulated drive"
-
-    @property
-    def frame_count(self) -> int:
-        """Number of images."""
-        return len(self.trajectory)
-
-    def frames(self) -> Iterator[Frame]:
-        """The images in time order."""
-        for index in range(len(self.trajectory)):
-            yield self.frame(index)
-
-    def frame(self, index: int) -> Frame:
-        """One image."""
-        image = render(self.street, self.camera, self.map_from_cam(index), self.look)
-        return Frame(int(self.trajectory.stamps_ns[index]), image)
-
-    def map_from_cam(self, index: int) -> Pose:
-        """The true pose of one image in the street's map frame."""
-        utm_from_cam = self.trajectory.pose(index)
-        return Pose(utm_from_cam.rotation, self.street.anchor.map_from_utm(utm_from_cam.translation_m))
-
-    def gnss_fixes(self) -> list[GnssFix]:
-        """All fixes in time order."""
-        return list(self.fixes)
-
-    def antenna(self) -> Antenna:
-        """Where the antenna sits in the camera's frame."""
-        offset = np.array(self.antenna_in_cam_m, dtype=np.float64)
-        return Antenna(offset, "static transform" if offset.any() else "same frame")
-
-    def imu_samples(self) -> Iterator[ImuSample]:
-        """None are simulated."""
-        return iter(())
-
-    def wheel_speeds(self) -> Iterator[WheelSpeed]:
-        """None are simulated."""
-        return iter(())
+    recording: Path
+    reference: Path  # the true poses of the images
+    markers: Path | None  # where the world's markers are, if it has some
 
 
-def simulate_drive(
-    street: Street,
-    *,
-    camera: Camera,
-    trajectory: Trajectory,
-    look: Look | None = None,
-    gnss: str | None = "rtk",
-    gnss_interval_s: float = 0.1,
-    gnss_gap_s: tuple[float, float] | None = None,
-    antenna_in_cam_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    seed: int = 0,
-    name: str = "simulated drive",
-) -> SimulatedDrive:
-    """A drive with the fixes that a receiver of the given error model would have reported.
+@dataclass(frozen=True)
+class _Message:
+    """Something ready to be written."""
 
-    Args:
-        street: where.
-        camera: with what.
-        trajectory: the camera's true poses ``utm_from_cam``, such as ``drive_along`` gives.
-        look: what lens and sensor make of the light.
-        gnss: "rtk", "consumer" (see fleetmap.gnss) or None for no fixes.
-        gnss_interval_s: seconds between fixes.
-        gnss_gap_s: start (seconds since the first image) and length of a stretch without fixes.
-        antenna_in_cam_m: the antenna in the camera's frame.
-        seed: of the fixes' errors.
-        name: what messages and provenance call the drive.
-
-    Raises:
-        InputError: an unknown error model, or an interval or gap that makes no sense.
-    """
-    fixes: list[GnssFix] = []
-    if gnss is not None:
-        if gnss not in GNSS_ERROR_MODELS:
-            raise InputError(f"there is no GNSS error model {gnss!r}; choose from {', '.join(GNSS_ERROR_MODELS)}")
-        fixes = sample_fixes(
-            trajectory,
-            GNSS_ERROR_MODELS[gnss],
-            interval_s=gnss_interval_s,
-            gap_s=gnss_gap_s,
-            antenna_in_cam_m=antenna_in_cam_m,
-            seed=seed,
-        )
-    return SimulatedDrive(street, camera, trajectory, look or Look(), tuple(fixes), antenna_in_cam_m, name)
+    stamp_ns: int
+    write: Callable[[DriveWriter], None]
+    is_image: bool = False
 
 
 def record_drive(
-    street: Street,
-    path: Path,
-    *,
-    camera: Camera,
-    trajectory: Trajectory,
-    look: Look | None = None,
-    gnss: str | None = "rtk",
-    gnss_interval_s: float = 0.1,
-    gnss_gap_s: tuple[float, float] | None = None,
-    antenna_in_cam_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    seed: int = 0,
-    force: bool = False,
-    progress: bool = False,
-) -> Path:
+    drive: SimulatedDrive, path: Path, *, force: bool = False, progress: bool = False, workers: int | None = None
+) -> Recorded:
     """Write a simulated drive as MCAP, and its truth beside it: ``survey.mcap``, ``survey.reference.tum``.
 
-    The truth never enters the recording. ``force`` replaces an existing recording, ``progress`` shows a bar on
-    stderr; the other arguments and errors are those of :func:`simulate_drive`.
+    The truth never enters the recording; where the world has markers, they come as ``survey.markers.json``. All
+    of them are there whole, or none is. The same drive gives the same bytes with any number of workers.
 
-    Returns:
-        The path of the reference.
+    Args:
+        drive: what to write.
+        path: the recording.
+        force: replace an existing recording.
+        progress: show a bar on stderr.
+        workers: threads that render; by default as many as this process has cores.
 
     Raises:
         OutputExistsError: the recording is there already and ``force`` is not given.
         StorageError: the disk is full or refuses.
     """
-    drive = simulate_drive(
-        street,
-        camera=camera,
-        trajectory=trajectory,
-        look=look,
-        gnss=gnss,
-        gnss_interval_s=gnss_interval_s,
-        gnss_gap_s=gnss_gap_s,
-        antenna_in_cam_m=antenna_in_cam_m,
-        seed=seed,
+    refuse_existing(path, force)
+    reference, markers = (path.with_name(path.stem + end) for end in (".reference.tum", ".markers.json"))
+    with ExitStack() as outputs:
+        write_trajectory(outputs.enter_context(atomic_path(reference)), drive.trajectory)
+        if drive.world.markers:
+            write_markers(outputs.enter_context(atomic_path(markers)), drive.world)
+        writer = outputs.enter_context(DriveWriter(path, drive.camera, force=force, camera_frame_id=CAMERA_FRAME))
+        _write_mounting(writer, drive)
+        images = tqdm(desc=f"render {path.name}", total=drive.frame_count, unit="image", disable=not progress)
+        with images:
+            for message in _messages(drive, workers):
+                message.write(writer)
+                images.update(message.is_image)
+    if not drive.world.markers:
+        markers.unlink(missing_ok=True)  # of the recording that was replaced
+    return Recorded(path, reference, markers if drive.world.markers else None)
+
+
+def write_markers(path: Path, world: World) -> None:
+    """Write where a world's ArUco markers are, as JSON in UTM.
+
+    ``corners_utm_m`` are easting, northing and ellipsoidal height of the black square's corners, clockwise from
+    the top left as one looks at it: the order in which OpenCV reports them.
+    """
+    content = {
+        "epsg": world.anchor.epsg,
+        "corner_order": "clockwise from the top left as seen from the front",
+        "markers": [_described(world, index) for index in range(len(world.markers))],
+    }
+    write_text_atomically(path, json.dumps(content, indent=1) + "\n")
+
+
+def _described(world: World, index: int) -> dict[str, object]:
+    marker = world.markers[index]
+    half = marker.side_m / 2.0
+    corners = np.array([[-half, half, 0.0], [half, half, 0.0], [half, -half, 0.0], [-half, -half, 0.0]])
+    middle = marker.map_from_marker
+    return {
+        "id": marker.number,
+        "dictionary": marker.dictionary,
+        "side_m": marker.side_m,
+        "position_utm_m": _rounded(world.anchor.utm_from_map(middle.translation_m)),
+        "quat_xyzw_utm_from_marker": _rounded(quat_xyzw_from_rotations(middle.rotation), 9),
+        "corners_utm_m": _rounded(world.anchor.utm_from_map(middle.transform(corners))),
+    }
+
+
+def _rounded(numbers: Array, digits: int = 6) -> object:
+    return np.round(numbers, digits).tolist()
+
+
+def _write_mounting(writer: DriveWriter, drive: SimulatedDrive) -> None:
+    """Say where everything is that is on board; an antenna in the camera's own frame needs no saying."""
+    mounting, sensors = drive.mounting, drive.sensors
+    on_board = [
+        (ANTENNA_FRAME, mounting.cam_from_antenna, bool(drive.fixes and any(mounting.antenna_in_cam_m))),
+        (IMU_FRAME, mounting.cam_from_imu, sensors.imu is not None),
+        (VEHICLE_FRAME, mounting.cam_from_vehicle, sensors.wheels is not None),
+        (LIDAR_FRAME, mounting.cam_from_lidar, sensors.lidar is not None),
+    ]
+    for frame, cam_from_sensor, is_there in on_board:
+        if is_there:
+            writer.write_static_transform(CAMERA_FRAME, frame, cam_from_sensor)
+
+
+def _messages(drive: SimulatedDrive, workers: int | None) -> Iterator[_Message]:
+    """Everything a drive records, in time order."""
+    antenna_frame = ANTENNA_FRAME if any(drive.mounting.antenna_in_cam_m) else CAMERA_FRAME
+    fixes = (
+        _Message(fix.stamp_ns, partial(DriveWriter.write_fix, fix=fix, frame_id=antenna_frame))
+        for fix in drive.fixes
     )
-    with DriveWriter(path, camera, force=force, camera_frame_id=_CAMERA_FRAME_ID) as writer:
-        _write_fixes(writer, drive)
-        label = f"render {path.name}"
-        for frame in tqdm(drive.frames(), label, drive.frame_count, unit="image", disable=not progress):
-            writer.write_image(frame.stamp_ns, frame.image)
-    reference = path.with_name(f"{path.stem}.reference.tum")
-    write_trajectory(reference, trajectory)
-    return reference
+    imu = (
+        _Message(sample.stamp_ns, partial(DriveWriter.write_imu, sample=sample, frame_id=IMU_FRAME))
+        for sample in drive.imu_samples()
+    )
+    wheels = (
+        _Message(speed.stamp_ns, partial(DriveWriter.write_wheel_speed, speed=speed, frame_id=VEHICLE_FRAME))
+        for speed in drive.wheel_speeds()
+    )
+    rendered = render_many(lambda make: make(), _rendering_jobs(drive), workers)
+    return heapq.merge(fixes, imu, wheels, rendered, key=lambda message: message.stamp_ns)
 
 
-def _write_fixes(writer: DriveWriter, drive: SimulatedDrive) -> None:
-    """Fixes in the camera's own frame, or in the antenna's with a static transform to it."""
-    frame_id = _CAMERA_FRAME_ID
-    if any(drive.antenna_in_cam_m):
-        frame_id = _ANTENNA_FRAME_ID
-        mounting = Pose(np.eye(3), np.array(drive.antenna_in_cam_m, dtype=np.float64))
-        writer.write_static_transform(_CAMERA_FRAME_ID, _ANTENNA_FRAME_ID, mounting)
-    for fix in drive.fixes:
-        writer.write_fix(fix, frame_id)
+def _rendering_jobs(drive: SimulatedDrive) -> Iterator[Callable[[], _Message]]:
+    """What takes time to make, in time order."""
+    stamps_ns = drive.trajectory.stamps_ns.tolist()
+    images = ((stamp_ns, partial(_image, drive, index)) for index, stamp_ns in enumerate(stamps_ns))
+    depths = ((stamp_ns, partial(_depth, drive, index)) for index, stamp_ns in enumerate(stamps_ns))
+    scans = ((stamp_ns, partial(_scan, drive, stamp_ns)) for stamp_ns in drive.scan_stamps_ns())
+    jobs = heapq.merge(images, depths if drive.sensors.depth else (), scans, key=lambda job: job[0])
+    return (make for _, make in jobs)
+
+
+def _image(drive: SimulatedDrive, index: int) -> _Message:
+    frame = drive.frame(index)
+    jpeg = encode_image(frame.image)
+    return _Message(frame.stamp_ns, lambda writer: writer.write_jpeg(frame.stamp_ns, jpeg), is_image=True)
+
+
+def _depth(drive: SimulatedDrive, index: int) -> _Message:
+    stamp_ns, depth_m = int(drive.trajectory.stamps_ns[index]), drive.depth(index)
+    return _Message(stamp_ns, lambda writer: writer.write_depth(stamp_ns, depth_m))
+
+
+def _scan(drive: SimulatedDrive, stamp_ns: int) -> _Message:
+    ranges_m, lidar = drive.scan(stamp_ns), drive.sensors.lidar
+    assert lidar is not None
+    return _Message(
+        stamp_ns,
+        partial(
+            DriveWriter.write_scan,
+            stamp_ns=stamp_ns,
+            ranges_m=ranges_m,
+            angle_min_rad=lidar.first_rad,
+            angle_increment_rad=lidar.step_rad,
+            range_min_m=lidar.nearest_m,
+            range_max_m=lidar.farthest_m,
+            frame_id=LIDAR_FRAME,
+            scan_time_s=lidar.scan_s,
+        ),
+    )

@@ -78,6 +78,16 @@ def test_it_slows_down_where_a_bend_would_be_uncomfortable(street: Street) -> No
     assert even.duration_s < 0.9 * motion.duration_s
 
 
+def test_the_traffic_around_it_slows_down_with_it(street: Street) -> None:
+    motion = plan_motion(street, speed_mps=14.0, lane_offset_m=3.5, start_m=5.0)
+    assert motion.traffic_s(0.0) == pytest.approx(5.0 / 14.0, rel=0.1)
+    after_s = motion.traffic_s(motion.duration_s) - motion.traffic_s(0.0)
+    _, positions = motion.poses(np.arange(0.0, motion.duration_s, 0.01))
+    way_m = np.linalg.norm(np.diff(positions, axis=0), axis=1).sum()
+    assert after_s == pytest.approx(way_m / 14.0, rel=0.01)
+    assert after_s < 0.9 * motion.duration_s
+
+
 def test_laps_of_a_circuit_follow_one_another_without_a_seam() -> None:
     world = build_world(3, kind="city", length_m=200.0)
     motion = plan_motion(world, speed_mps=8.0, start_m=150.0, end_m=500.0)

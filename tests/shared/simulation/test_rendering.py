@@ -12,8 +12,8 @@ from fleetmap.geometry import Pose, so3_exp
 from fleetmap.simulation.atlas import build_atlas
 from fleetmap.simulation.driving import drive_along
 from fleetmap.simulation.look import Look
-from fleetmap.simulation.recording import simulate_drive
 from fleetmap.simulation.rendering import render, render_depth, true_points
+from fleetmap.simulation.simulated_drive import simulate_drive
 from fleetmap.simulation.street import Street
 from fleetmap.simulation.surfaces import SurfaceBuilder
 
@@ -64,8 +64,7 @@ def test_outlines_lie_where_they_project(street: Street, camera: Camera, shift_p
     column, row = round(camera.cx_px), round(camera.cy_px)
     offsets = np.array([[-0.655, 0.0, 0.0], [0.655, 0.0, 0.0], [0.0, -0.265, 0.0], [0.0, 0.265, 0.0]])
     left, right, top, bottom = camera.project(wall.mean(axis=0) + offsets)
-    # With distortion each sample asks its neighbour on an even grid: half a pixel at most, less on average.
-    tolerance_px = 0.5 if any(camera.distortion) else 0.26
+    tolerance_px = 0.26
     assert abs(dark[row].sum() - (right[0] - left[0])) < 2.0 * tolerance_px
     assert abs(_centroid(dark[row]) - (left[0] + right[0]) / 2.0) < tolerance_px
     assert abs(dark[:, column].sum() - (bottom[1] - top[1])) < 2.0 * tolerance_px

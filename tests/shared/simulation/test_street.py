@@ -12,8 +12,8 @@ from fleetmap.errors import InputError
 from fleetmap.geodesy import UtmGrid
 from fleetmap.geometry import Pose
 from fleetmap.simulation.driving import drive_along
-from fleetmap.simulation.recording import SimulatedDrive, simulate_drive
 from fleetmap.simulation.rendering import render_depth, true_points
+from fleetmap.simulation.simulated_drive import SimulatedDrive, simulate_drive
 from fleetmap.simulation.street import Street, build_street
 
 _WIDE = Camera(640, 240, 370.0, 370.0, 319.5, 119.5)
@@ -41,7 +41,7 @@ def test_it_stands_at_its_site() -> None:
 
 
 def test_depths_reach_from_parked_cars_to_the_horizon(drive: SimulatedDrive) -> None:
-    depth = render_depth(drive.street, _WIDE, drive.map_from_cam(5))
+    depth = render_depth(drive.world.scene, _WIDE, drive.map_from_cam(5))
     finite = depth[np.isfinite(depth)]
     assert 1.5 < np.percentile(finite, 1) < 7.0
     assert 6.0 < np.median(finite) < 40.0
@@ -51,7 +51,7 @@ def test_depths_reach_from_parked_cars_to_the_horizon(drive: SimulatedDrive) -> 
 
 def test_the_road_under_the_camera_is_its_height_below(drive: SimulatedDrive) -> None:
     pose = drive.map_from_cam(2)
-    ground = true_points(drive.street, _WIDE, pose, np.array([[300.0, 238.0]]))[0]
+    ground = true_points(drive.world.scene, _WIDE, pose, np.array([[300.0, 238.0]]))[0]
     assert ground[2] - pose.translation_m[2] == pytest.approx(-1.65, abs=0.1)
 
 
@@ -72,7 +72,7 @@ def _track(drive: SimulatedDrive, first: int, second: int) -> tuple[float, float
     pairs = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(words_a, words_b, k=2)
     good = [best for best, next_best in pairs if best.distance < min(64.0, 0.8 * next_best.distance)]
     here, there = pixels_a[[m.queryIdx for m in good]], pixels_b[[m.trainIdx for m in good]]
-    points = true_points(drive.street, drive.camera, drive.map_from_cam(first), here)
+    points = true_points(drive.world.scene, drive.camera, drive.map_from_cam(first), here)
     expected = drive.camera.project(_cam_from_map(drive, second).transform(points))
     error_px = np.linalg.norm(expected - there, axis=1)
     error_px = error_px[np.isfinite(error_px)]
