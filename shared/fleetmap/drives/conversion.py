@@ -17,8 +17,8 @@ import numpy as np
 from fleetmap.camera import Camera
 from fleetmap.drive import GnssFix, ImuSample
 from fleetmap.drives.image_codec import Image, decode_compressed
-from fleetmap.drives.ros2_messages import COMPRESSED_IMAGE, IMAGE, NAV_SAT_FIX
-from fleetmap.drives.ros2_writer import IMU, DriveWriter
+from fleetmap.drives.ros2_messages import COMPRESSED_IMAGE, IMAGE, IMU, NAV_SAT_FIX
+from fleetmap.drives.ros2_writer import DriveWriter
 from fleetmap.errors import CalibrationError, DriveError
 from fleetmap.geometry import Pose
 from fleetmap.gnss import GNSS_ERROR_MODELS, sample_fixes

@@ -21,8 +21,10 @@ from fleetmap.drives.ros2_messages import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
     IMAGE,
+    IMU,
     NAV_SAT_FIX,
     TF_MESSAGE,
+    TWIST_STAMPED,
     definition_text,
     encode,
     standard_typestore,
@@ -31,8 +33,7 @@ from fleetmap.errors import CalibrationError
 from fleetmap.files import atomic_path, refuse_existing
 from fleetmap.geometry import Array, Pose, quat_xyzw_from_rotations
 
-IMU = "sensor_msgs/msg/Imu"
-_TWIST_STAMPED, _LASER_SCAN = "geometry_msgs/msg/TwistStamped", "sensor_msgs/msg/LaserScan"
+_LASER_SCAN = "sensor_msgs/msg/LaserScan"
 _TF_STATIC_TOPIC = "/tf_static"
 _COVARIANCE_KNOWN, _FIX, _GPS = 3, 0, 1  # constants of sensor_msgs/NavSatFix and NavSatStatus
 _NOT_MEASURED = -1.0  # first element of a sensor_msgs/Imu covariance whose quantity the sensor does not give
@@ -164,7 +165,7 @@ class DriveWriter:
         twist = self._types["geometry_msgs/msg/Twist"](
             linear=self._vector(np.array([speed.speed_mps, 0.0, 0.0])), angular=self._vector(np.zeros(3))
         )
-        message = self._types[_TWIST_STAMPED](header=self._header(speed.stamp_ns, frame_id), twist=twist)
+        message = self._types[TWIST_STAMPED](header=self._header(speed.stamp_ns, frame_id), twist=twist)
         self._write(self._wheel_topic, message, speed.stamp_ns)
 
     def write_depth(self, stamp_ns: int, depth_m: NDArray[np.floating[Any]]) -> None:

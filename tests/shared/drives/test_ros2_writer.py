@@ -89,18 +89,6 @@ def test_another_tool_reads_the_same(written):
     assert log_times[0] == T0_NS
 
 
-def messages_on(path: Path) -> dict[str, list]:
-    """What rosbags' AnyReader reads, by topic."""
-    with AnyReader([path]) as reader:
-        messages: dict[str, list] = {topic: [] for topic in reader.topics}
-        for connection, log_time, raw in reader.messages():
-            message = reader.deserialize(raw, connection.msgtype)
-            messages[connection.topic].append(message)
-            if hasattr(message, "header"):
-                assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == log_time
-    return messages
-
-
 @pytest.mark.parametrize(
     ("model", "coefficients"),
     [
@@ -109,20 +97,22 @@ def messages_on(path: Path) -> dict[str, list]:
         ("equidistant", (0.01, -0.02, 0.003, -0.0004)),
     ],
 )
-def test_every_distortion_model_is_written_by_its_ros_name(tmp_path, pictures, model, coefficients):
+def test_every_distortion_model_is_written_by_its_ros_name(
+    tmp_path, pictures, model, coefficients, read_by_rosbags
+):
     camera = Camera(64, 48, 50.0, 51.0, 31.5, 23.5, coefficients, model)
     with DriveWriter(tmp_path / "drive.mcap", camera) as writer:
         writer.write_image(T0_NS, pictures[0])
-    (info,) = messages_on(tmp_path / "drive.mcap")["/camera/camera_info"]
+    (info,) = read_by_rosbags(tmp_path / "drive.mcap")["/camera/camera_info"]
     assert (info.distortion_model, tuple(info.d)) == (model, coefficients)
 
 
-def test_an_imu_measurement_is_read_by_another_tool(tmp_path):
+def test_an_imu_measurement_is_read_by_another_tool(tmp_path, read_by_rosbags):
     gyro_covariance = np.diag([1e-4, 2e-4, 3e-4])
     with DriveWriter(tmp_path / "drive.mcap", None) as writer:
         sample = ImuSample(T0_NS, np.array([0.1, -0.2, 0.3]), np.array([0.5, -0.25, 9.81]))
         writer.write_imu(sample, "imu", angular_velocity_covariance=gyro_covariance)
-    (imu,) = messages_on(tmp_path / "drive.mcap")["/imu/data"]
+    (imu,) = read_by_rosbags(tmp_path / "drive.mcap")["/imu/data"]
     gyro, accelerometer = imu.angular_velocity, imu.linear_acceleration
     assert (gyro.x, gyro.y, gyro.z) == (0.1, -0.2, 0.3)
     assert (accelerometer.x, accelerometer.y, accelerometer.z) == (0.5, -0.25, 9.81)
@@ -132,21 +122,21 @@ def test_an_imu_measurement_is_read_by_another_tool(tmp_path):
     assert not imu.linear_acceleration_covariance.any()
 
 
-def test_a_wheel_speed_is_the_twist_along_x(tmp_path):
+def test_a_wheel_speed_is_the_twist_along_x(tmp_path, read_by_rosbags):
     with DriveWriter(tmp_path / "drive.mcap", None) as writer:
         writer.write_wheel_speed(WheelSpeed(T0_NS, -1.25))
-    (speed,) = messages_on(tmp_path / "drive.mcap")["/vehicle/speed"]
+    (speed,) = read_by_rosbags(tmp_path / "drive.mcap")["/vehicle/speed"]
     linear, angular = speed.twist.linear, speed.twist.angular
     assert speed.header.frame_id == "base_link"
     assert (linear.x, linear.y, linear.z, angular.x, angular.y, angular.z) == (-1.25, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
-def test_a_depth_image_is_in_millimetres_with_zero_for_no_return(tmp_path):
+def test_a_depth_image_is_in_millimetres_with_zero_for_no_return(tmp_path, read_by_rosbags):
     depth_m = np.full((48, 64), 1.2344, dtype=np.float32)
     depth_m[0, :6] = [0.0, np.nan, np.inf, -1.0, 65.535, 65.6]
     with DriveWriter(tmp_path / "drive.mcap", CAMERA, camera_frame_id="cam", compress_chunks=True) as writer:
         writer.write_depth(T0_NS, depth_m)
-    messages = messages_on(tmp_path / "drive.mcap")
+    messages = read_by_rosbags(tmp_path / "drive.mcap")
     (depth,), (info,) = messages["/camera/depth/image"], messages["/camera/depth/camera_info"]
     assert (depth.encoding, depth.height, depth.width, depth.step) == ("16UC1", 48, 64, 128)
     millimetres = depth.data.view("<u2").reshape(48, 64)
@@ -165,14 +155,14 @@ def test_a_depth_image_of_another_size_is_refused_with_the_numbers(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_scan_is_read_by_another_tool(tmp_path):
+def test_a_scan_is_read_by_another_tool(tmp_path, read_by_rosbags):
     ranges_m = np.array([1.0, np.inf, 3.5, 2.25, 0.5], dtype=np.float32)
     with DriveWriter(tmp_path / "drive.mcap", None) as writer:
         writer.write_scan(
             T0_NS, ranges_m, angle_min_rad=-1.0, angle_increment_rad=0.5, range_min_m=0.1, range_max_m=30.0,
             scan_time_s=0.1,
         )  # fmt: skip
-    (scan,) = messages_on(tmp_path / "drive.mcap")["/scan"]
+    (scan,) = read_by_rosbags(tmp_path / "drive.mcap")["/scan"]
     assert np.array_equal(scan.ranges, ranges_m)
     assert (scan.angle_min, scan.angle_max, scan.angle_increment) == (-1.0, 1.0, 0.5)
     assert (scan.range_min, scan.range_max) == pytest.approx((0.1, 30.0))
@@ -200,11 +190,11 @@ def test_the_same_calls_give_the_same_bytes(tmp_path, pictures, compress_chunks)
     assert first == second
 
 
-def test_compressed_chunks_are_smaller_and_hold_the_same(tmp_path, pictures):
+def test_compressed_chunks_are_smaller_and_hold_the_same(tmp_path, pictures, read_by_rosbags):
     plain = write_every_sensor(tmp_path / "plain.mcap", pictures, compress_chunks=False)
     packed = write_every_sensor(tmp_path / "packed.mcap", pictures, compress_chunks=True)
     assert 0 < len(packed) < 0.6 * len(plain)
-    before, after = messages_on(tmp_path / "plain.mcap"), messages_on(tmp_path / "packed.mcap")
+    before, after = read_by_rosbags(tmp_path / "plain.mcap"), read_by_rosbags(tmp_path / "packed.mcap")
     assert before.keys() == after.keys()
     for topic in ("/camera/depth/image", "/camera/image/compressed"):
         assert [m.data.tobytes() for m in before[topic]] == [m.data.tobytes() for m in after[topic]]
