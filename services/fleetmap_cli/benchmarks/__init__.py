@@ -1,0 +1,1 @@
+"""What ``fleetmap benchmark`` measures: one module a benchmark, a list of rows each."""

@@ -1,0 +1,84 @@
+"""``fleetmap benchmark``: measure the product on real and simulated drives."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+
+import click
+
+from fleetmap_cli.benchmarks.report import missing_line, table
+from fleetmap_cli.benchmarks.row import Benchmark
+from fleetmap_cli.benchmarks.running import run_benchmark
+from fleetmap_cli.demo_processes import interrupted_once
+
+_NAMES = ("drives", "mapper", "localizer", "server")
+
+
+@click.command()
+@click.argument("name", type=click.Choice(_NAMES))
+@click.option(
+    "--data",
+    type=click.Path(path_type=Path, file_okay=False),
+    envvar="FLEETMAP_DATA",
+    default=Path("../shared/data"),
+    show_default=True,
+    show_envvar=True,
+    help="The folder of public recordings, shown as DATA in commands. Rows whose recordings are not there are "
+    "skipped with a line.",
+)
+@click.option(
+    "--output",
+    type=click.Path(path_type=Path, file_okay=False),
+    metavar="FOLDER",
+    help="Write NAME.md, NAME.json and the pictures here.  [default: benchmark-NAME]",
+)
+@click.option("--rows", metavar="ROW,ROW,...", help="Measure these rows only.  [default: all]")
+@click.option("--list", "list_rows", is_flag=True, help="Say what the rows measure and need, and measure nothing.")
+@click.option("--force", is_flag=True, help="Replace the results of an earlier run.")
+def benchmark(
+    name: str, data: Path, output: Path | None, rows: str | None, list_rows: bool, force: bool
+) -> int | None:
+    """Measure NAME, and print one table whose rows show the commands that make them.
+
+    \b
+      drives      is the simulated world as hard to see as a real one; rendering speed; a recording of
+                  4 GB in bounded memory; what a spline through the fixes alone gives; clock offsets
+      mapper      maps of the real drives with each kind of GNSS, and without, against their references
+                  and beside a smoothing spline through the same fixes
+      localizer   a second camera in the map of the first
+      server      a map published and fetched over loopback, beside raw TCP
+
+    The table is also written as NAME.md, beside NAME.json and pictures, after every row: what is measured stays
+    when a later row is interrupted. A row that fails says why, and the exit code is 1. Recordings and maps are
+    made in the output folder and removed again.
+
+    \b
+    Examples:
+      fleetmap benchmark drives --data DATA --output results
+      fleetmap benchmark mapper --rows odo-rtk-5s,odo-consumer
+    """
+    chosen = _benchmark(name)
+    if list_rows:
+        for row in chosen.rows:
+            needs = f" (needs {', '.join(f'DATA/{place}' for place in row.needs)})" if row.needs else ""
+            click.echo(f"{row.name:<16} {row.about}{needs}")
+        return None
+    names = [word for word in (rows or "").split(",") if word]
+    folder = output or Path(f"benchmark-{name}")
+    with interrupted_once():
+        outcomes = run_benchmark(
+            chosen, data, folder, row_names=names, force=force, tell=lambda line: click.echo(line, err=True)
+        )
+    if any(outcome.status != "skipped" for outcome in outcomes):
+        click.echo(table(chosen, outcomes))
+    for outcome in outcomes:
+        if outcome.status != "measured":
+            click.echo(missing_line(outcome))
+    return 1 if any(outcome.status == "failed" for outcome in outcomes) else None
+
+
+def _benchmark(name: str) -> Benchmark:
+    module = importlib.import_module(f"fleetmap_cli.benchmarks.{name}")
+    found: Benchmark = module.BENCHMARK
+    return found
