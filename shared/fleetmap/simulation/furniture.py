@@ -105,15 +105,20 @@ def place_furniture(
         foot, heading = line.at(where, left_m), float(line.heading_rad(where))
         kind = rng.random()
         if kind < 0.35:
-            builder.add_box(foot, heading, (0.14, 0.14, 6.2), paint.metal)
-            builder.add_box(raised(foot, 6.2), heading, (0.9, 0.3, 0.15), paint.metal)
-            _hang_lamp(builder, raised(foot, 6.19), heading, paint.metal)
+            put_up_lamp(builder, paint.metal, foot, heading, 6.2)
         elif kind < 0.7:
             builder.add_box(foot, heading, (0.07, 0.07, 3.0), paint.metal)
             builder.add_box(raised(foot, 2.2), heading, (0.03, 0.7, 0.7), int(rng.choice(paint.signs)))
         else:
             size = (float(rng.uniform(0.5, 1.1)), float(rng.uniform(0.4, 0.6)), float(rng.uniform(0.8, 1.3)))
             builder.add_box(foot, heading, size, int(rng.choice(paint.boxes)))
+
+
+def put_up_lamp(builder: SurfaceBuilder, metal: int, foot: Array, heading_rad: float, height_m: float) -> None:
+    """A lamp post."""
+    builder.add_box(foot, heading_rad, (0.14, 0.14, height_m), metal)
+    builder.add_box(raised(foot, height_m), heading_rad, (0.9, 0.3, 0.15), metal)
+    _hang_lamp(builder, raised(foot, height_m - 0.01), heading_rad, metal)
 
 
 def _hang_lamp(builder: SurfaceBuilder, middle: Array, heading_rad: float, texture: int) -> None:

@@ -14,7 +14,7 @@ from fleetmap.simulation.ground import STREET_HALF_M, ground_corners
 from fleetmap.simulation.palette import Palette
 from fleetmap.simulation.plot import GridLine, Kerb, Plot, marker_places
 from fleetmap.simulation.roads import RoadPath
-from fleetmap.simulation.surfaces import SurfaceBuilder, raised
+from fleetmap.simulation.surfaces import SurfaceBuilder
 
 Array = NDArray[np.float64]
 Rng = np.random.Generator
@@ -67,8 +67,7 @@ def _light(rng: Rng, builder: SurfaceBuilder, palette: Palette, path: RoadPath, 
     places = np.stack([u.ravel(), v.ravel()], axis=1) + rng.uniform(-3.0, 3.0, (u.size, 2))
     for place in places[path.distance_m(places) > _CLEAR_M]:
         foot = path.terrain.at(*place)
-        builder.add_box(foot, path.terrain.heading_rad, (0.16, 0.16, 7.5), palette.metal())
-        builder.add_box(raised(foot, 7.5), path.terrain.heading_rad, (1.2, 0.4, 0.18), palette.metal())
+        furniture.put_up_lamp(builder, palette.metal(), foot, path.terrain.heading_rad, 7.5)
 
 
 def _bays(path: RoadPath, low: Array, high: Array) -> list[Kerb]:

@@ -118,14 +118,14 @@ def send_traffic(
     """Cars that come towards the recording vehicle in the other lane, and one that drives ahead of it.
 
     The one ahead keeps the recording vehicle's speed, nearer where traffic is denser; from 60 cars a kilometre on
-    it is a van some 6 m ahead. None when nothing moves.
+    it is a van, whose rear is 6 m away and less. None when nothing moves.
     """
     oncoming = round(cars_per_km * (stretch_m[1] - stretch_m[0]) / 1000.0)
     if cars_per_km <= 0.0:
         return None
     own = _measure_lane(line, stretch_m, own_lane_m, is_closed)
     other = _measure_lane(line, stretch_m, LANE_M if own_lane_m <= LANE_M / 2.0 else 0.0, is_closed)
-    ahead_m = float(np.interp(cars_per_km, [0.0, 60.0], [24.0, 8.5]))
+    ahead_m = float(np.interp(cars_per_km, [0.0, 60.0, 120.0], [24.0, 9.0, 7.0]))
     begin = float(np.interp(0.0, own.s_m, own.travelled_m))
     places = (np.arange(oncoming) + rng.uniform(0.1, 0.9, oncoming)) * other.travelled_m[-1] / max(oncoming, 1)
     numbers = [4 if cars_per_km >= 60.0 else 0, *rng.integers(0, CAR_PAINTS, oncoming).tolist()]
