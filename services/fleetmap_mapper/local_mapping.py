@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.geometry import Pose
-from fleetmap.vision.matching import match_epipolar
+from fleetmap.vision.epipolar_matching import match_epipolar
 from fleetmap_mapper.adjustment import AdjustmentProblem, adjust
 from fleetmap_mapper.growing_map import SCALE_FACTOR, GrowingMap, Ids, Keyframe
 from fleetmap_mapper.settings import MapperSettings

@@ -1,4 +1,4 @@
-"""Matching of binary descriptors by Hamming distance: freely, around predictions, and along epipolar lines.
+"""Matching of binary descriptors by Hamming distance: freely, and around predictions.
 
 The loops are compiled; descriptors of 32 bytes are looked at as four 64-bit words.
 """
@@ -18,7 +18,6 @@ Descriptors = NDArray[np.uint8]
 
 _NO_PAIR = 1 << 20  # a Hamming distance that no pair has
 _CELL_PX = 16.0
-_EPIPOLE_RADIUS_PX = 10.0  # around the epipole every line passes close by, and the depth is unseen
 
 
 def match_descriptors(
@@ -65,7 +64,7 @@ def match_by_projection(
     """
     if len(predicted_px) == 0 or len(features) == 0:
         return np.full(len(predicted_px), -1, dtype=np.int32)
-    origin, cells_across, cells_down, starts, members = _grid(features.pixels)
+    origin, cells_across, cells_down, starts, members = grid(features.pixels, _CELL_PX)
     chosen: IntArray = _match_in_windows(
         np.ascontiguousarray(predicted_px, dtype=np.float64),
         np.ascontiguousarray(radii_px, dtype=np.float64),
@@ -84,44 +83,6 @@ def match_by_projection(
         ratio,
     )
     return chosen
-
-
-def match_epipolar(
-    features_a: Features,
-    features_b: Features,
-    use_a: BoolArray,
-    use_b: BoolArray,
-    fundamental_ba: Array,
-    epipole_in_b_px: Array,
-    max_distance: int,
-    sigma_threshold: float = 1.96,
-) -> IntArray:
-    """Index pairs (P, 2) int32 of features that look alike and lie on each other's epipolar line, sorted by a.
-
-    Args:
-        features_a: of the first image; use_a: (N,) which of them may be matched.
-        features_b: of the second image; use_b: (M,).
-        fundamental_ba: (3, 3) with x_b^T F x_a = 0 for undistorted pixels.
-        epipole_in_b_px: (2,) image of camera a's centre in b; features near it are left out. NaN = anywhere.
-        max_distance: Hamming bits; a pair is each other's closest among the candidates.
-        sigma_threshold: distance to the line, in sigmas of the feature in b.
-    """
-    if len(features_a) == 0 or len(features_b) == 0:
-        return np.zeros((0, 2), dtype=np.int32)
-    pairs: IntArray = _match_along_lines(
-        np.ascontiguousarray(features_a.pixels),
-        as_words(features_a.descriptors),
-        np.flatnonzero(use_a),
-        np.ascontiguousarray(features_b.pixels),
-        as_words(features_b.descriptors),
-        np.flatnonzero(use_b),
-        features_b.sigmas_px,
-        np.ascontiguousarray(fundamental_ba, dtype=np.float64),
-        np.asarray(epipole_in_b_px, dtype=np.float64),
-        max_distance,
-        sigma_threshold,
-    )
-    return pairs
 
 
 def medoid_descriptor(descriptors: Descriptors) -> int:
@@ -192,11 +153,12 @@ def _match_all(words_a, words_b, max_distance, ratio, mutual):  # type: ignore[n
                 a_of_b[j] = i
         if best <= max_distance and best <= ratio * second:
             b_of_a[i] = chosen
-    return _pairs(b_of_a, a_of_b, mutual)
+    return index_pairs(b_of_a, a_of_b, mutual)
 
 
 @njit(cache=True, nogil=True)
-def _pairs(b_of_a, a_of_b, mutual):  # type: ignore[no-untyped-def]
+def index_pairs(b_of_a, a_of_b, mutual):  # type: ignore[no-untyped-def]
+    """Pairs (P, 2) int32 from the partner of each a and of each b (-1 = none), sorted by a."""
     pairs = np.empty((len(b_of_a), 2), np.int32)
     found = 0
     for i in range(len(b_of_a)):
@@ -208,16 +170,16 @@ def _pairs(b_of_a, a_of_b, mutual):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _grid(pixels):  # type: ignore[no-untyped-def]
+def grid(pixels, cell_px):  # type: ignore[no-untyped-def]
     """Features sorted into square cells: cell c holds members[starts[c]:starts[c + 1]]."""
     origin = np.array([pixels[:, 0].min(), pixels[:, 1].min()])
-    across = int((pixels[:, 0].max() - origin[0]) / _CELL_PX) + 1
-    down = int((pixels[:, 1].max() - origin[1]) / _CELL_PX) + 1
+    across = int((pixels[:, 0].max() - origin[0]) / cell_px) + 1
+    down = int((pixels[:, 1].max() - origin[1]) / cell_px) + 1
     cells = np.empty(len(pixels), np.int64)
     starts = np.zeros(across * down + 1, np.int64)
     for i in range(len(pixels)):
-        column = int((pixels[i, 0] - origin[0]) / _CELL_PX)
-        row = int((pixels[i, 1] - origin[1]) / _CELL_PX)
+        column = int((pixels[i, 0] - origin[0]) / cell_px)
+        row = int((pixels[i, 1] - origin[1]) / cell_px)
         cells[i] = row * across + column
         starts[cells[i] + 1] += 1
     for c in range(across * down):
@@ -285,49 +247,6 @@ def _match_in_windows(  # type: ignore[no-untyped-def]
             taken_at[best_feature], taken_by[best_feature] = best, landmark
             chosen[landmark] = best_feature
     return chosen
-
-
-@njit(cache=True, nogil=True)
-def _match_along_lines(  # type: ignore[no-untyped-def]
-    pixels_a, words_a, chosen_a, pixels_b, words_b, chosen_b, sigmas_b, F, epipole, max_distance, sigma_threshold
-):
-    """The features of b are packed first, so that the scan along each line reads memory in order."""
-    packed_b = np.empty(len(chosen_b), np.int64)
-    x_b, y_b, reach_b = np.empty(len(chosen_b)), np.empty(len(chosen_b)), np.empty(len(chosen_b))
-    count_b = 0
-    for j in chosen_b:
-        if np.isfinite(epipole[0]) and np.isfinite(epipole[1]):
-            du, dv = pixels_b[j, 0] - epipole[0], pixels_b[j, 1] - epipole[1]
-            if np.sqrt(du * du + dv * dv) < _EPIPOLE_RADIUS_PX * sigmas_b[j]:
-                continue
-        packed_b[count_b], x_b[count_b], y_b[count_b] = j, pixels_b[j, 0], pixels_b[j, 1]
-        reach_b[count_b] = sigma_threshold * sigmas_b[j]
-        count_b += 1
-    best_of_b = np.full(len(pixels_b), max_distance + 1, np.int64)
-    a_of_b = np.full(len(pixels_b), -1, np.int32)
-    b_of_a = np.full(len(pixels_a), -1, np.int32)
-    for i in chosen_a:
-        u, v = pixels_a[i, 0], pixels_a[i, 1]
-        line_x = F[0, 0] * u + F[0, 1] * v + F[0, 2]
-        line_y = F[1, 0] * u + F[1, 1] * v + F[1, 2]
-        line_w = F[2, 0] * u + F[2, 1] * v + F[2, 2]
-        length = np.sqrt(line_x * line_x + line_y * line_y)
-        if not length > 0.0:
-            continue
-        line_x, line_y, line_w = line_x / length, line_y / length, line_w / length
-        best = max_distance + 1
-        for k in range(count_b):
-            if abs(line_x * x_b[k] + line_y * y_b[k] + line_w) > reach_b[k]:
-                continue
-            j = packed_b[k]
-            distance = hamming(words_a, i, words_b, j)
-            if distance < best:
-                best = distance
-                b_of_a[i] = j
-            if distance < best_of_b[j]:
-                best_of_b[j] = distance
-                a_of_b[j] = i
-    return _pairs(b_of_a, a_of_b, True)
 
 
 @njit(cache=True, nogil=True)

@@ -10,7 +10,6 @@ from fleetmap.vision.matching import (
     hamming,
     match_by_projection,
     match_descriptors,
-    match_epipolar,
     medoid_descriptor,
     nearest_words,
 )
@@ -82,9 +81,6 @@ def test_nothing_matches_nothing() -> None:
     assert match_descriptors(none, some, 64).shape == (0, 2)
     assert match_descriptors(some, none, 64).shape == (0, 2)
     empty = features_at(np.zeros((0, 2)), none)
-    full = features_at(np.ones((4, 2)), some)
-    flags = np.ones(4, bool)
-    assert match_epipolar(empty, full, flags[:0], flags, np.eye(3), np.full(2, np.nan), 64).shape == (0, 2)
     found = match_by_projection(
         np.ones((4, 2)), np.ones(4), np.zeros(4, int), np.full(4, 7), some, empty, max_distance=64, ratio=0.8
     )
@@ -142,62 +138,6 @@ def test_projection_applies_the_ratio_between_neighbouring_octaves_only() -> Non
     apart = features_at(pixels, candidates, np.array([2, 5]))
     assert match_by_projection(*window, neighbours, max_distance=50, ratio=0.8).tolist() == [-1]
     assert match_by_projection(*window, apart, max_distance=50, ratio=0.8).tolist() == [0]
-
-
-def two_views(count: int = 400) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Pixels of common points in two cameras, F with x_b^T F x_a = 0, and a's centre seen in b."""
-    rng = np.random.default_rng(7)
-    points = rng.uniform((-6, -3, 6), (6, 3, 25), (count, 3))
-    angle = 0.05
-    rotation = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
-    t = np.array([0.2, 0.05, -1.5])
-    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
-    fundamental = np.linalg.inv(K).T @ cross @ rotation @ np.linalg.inv(K)
-    in_b = points @ rotation.T + t
-    pixels_a, pixels_b = (points @ K.T)[:, :2] / points[:, 2:], (in_b @ K.T)[:, :2] / in_b[:, 2:]
-    epipole = (K @ t)[:2] / t[2]
-    return pixels_a, pixels_b, fundamental, epipole
-
-
-def test_epipolar_matching_finds_true_pairs_among_look_alikes() -> None:
-    pixels_a, pixels_b, fundamental, epipole = two_views()
-    descriptors = random_descriptors(400)
-    descriptors[200:] = flip_bits(descriptors[:200], 12)  # everything has a look-alike elsewhere in the image
-    noise = np.random.default_rng(1).normal(0.0, 0.3, pixels_b.shape)
-    a, b = features_at(pixels_a, descriptors), features_at(pixels_b + noise, flip_bits(descriptors, 10, seed=9))
-    pairs = match_epipolar(a, b, np.ones(400, bool), np.ones(400, bool), fundamental, epipole, 60)
-    true = pairs[:, 0] == pairs[:, 1]
-    far_from_epipole = np.linalg.norm(b.pixels - epipole, axis=1) > 10.0
-    assert len(pairs) > 0.97 * far_from_epipole.sum()
-    assert true.mean() > 0.97
-    assert len(np.unique(pairs[:, 1])) == len(pairs)
-
-
-def test_epipolar_matching_respects_the_line_the_epipole_and_the_flags() -> None:
-    pixels_a, pixels_b, fundamental, epipole = two_views()
-    descriptors = random_descriptors(400)
-    a = features_at(pixels_a, descriptors)
-    every = np.ones(400, bool)
-    anywhere = np.full(2, np.nan)
-
-    lines = np.c_[pixels_a, np.ones(400)] @ fundamental.T
-    normals = lines[:, :2] / np.linalg.norm(lines[:, :2], axis=1, keepdims=True)
-    for off_px, expected in ((1.9, 400), (2.1, 0)):
-        b = features_at(pixels_b + off_px * normals, descriptors)
-        assert len(match_epipolar(a, b, every, every, fundamental, anywhere, 0)) == expected
-    coarse = features_at(pixels_b + 2.1 * normals, descriptors, np.full(400, 1))
-    assert len(match_epipolar(a, coarse, every, every, fundamental, anywhere, 0)) == 400
-
-    b = features_at(pixels_b, descriptors)
-    near = np.linalg.norm(pixels_b - epipole, axis=1) < 10.0
-    assert 0 < near.sum() < 20
-    pairs = match_epipolar(a, b, every, every, fundamental, epipole, 0)
-    assert not np.any(near[pairs[:, 1]])
-    assert len(pairs) == 400 - near.sum()
-
-    use_a, use_b = np.arange(400) % 2 == 0, np.arange(400) % 3 == 0
-    pairs = match_epipolar(a, b, use_a, use_b, fundamental, anywhere, 0)
-    assert np.array_equal(pairs[:, 0], np.flatnonzero(use_a & use_b))
 
 
 def test_the_medoid_is_the_descriptor_in_the_middle() -> None:
