@@ -17,6 +17,7 @@ FloatImage = NDArray[np.float32]
 
 _METER_EVERY_PX = 6
 _METER_STEPS = 14
+_DAY_GREY = 100.0
 _EXPOSURE_RANGE = (0.25, 16.0)  # what an automatic exposure reaches
 _MEAN_BRIGHTNESS = 0.8  # of a surface: where a change of the sun's contrast turns about
 
@@ -112,6 +113,8 @@ def look_of_drive(name: str, seed: int) -> Look:
         raise InputError(f"there is no look '{name}'; choose from {', '.join(LOOKS)}")
     look, rng = LOOKS[name], np.random.default_rng([seed, zlib.crc32(name.encode())])
     grey = look.auto_exposure_grey
+    if grey is None and rng.random() < 0.5:  # by day the one camera adapts, the other is set once
+        grey = _DAY_GREY
     return replace(
         look,
         exposure=look.exposure * rng.uniform(0.8, 1.1) if grey is None else look.exposure,

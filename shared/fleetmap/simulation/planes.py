@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from fleetmap.geometry import Pose
 from fleetmap.simulation.surfaces import Surfaces
 
 Array = NDArray[np.float64]
@@ -38,7 +39,8 @@ def surfaces_in_cone(
     smaller than ``smallest_rad``. ``slack_m`` lets the camera move. The nearest come first.
     """
     limits = (float(widest_rad), float(smallest_rad), float(slack_m), float(farthest_m))
-    distance = _distances_in_cone(surfaces.corners_in_map, centre_m, np.ascontiguousarray(axis), limits)
+    centre, direction = (np.array(a, np.float64, order="C") for a in (centre_m, axis))
+    distance = _distances_in_cone(surfaces.corners_in_map, centre, direction, limits)
     found = np.flatnonzero(np.isfinite(distance))
     found = found[np.argsort(distance[found], kind="stable")]
     return found, distance[found]
@@ -70,15 +72,24 @@ def _distances_in_cone(corners: Any, centre: Any, axis: Any, limits: Any) -> Any
     return distances
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def planes_in_cam(corners: Any, two_sided: Any, map_from_cam: Any, centre: Any, planes: Any) -> None:
-    """Fill ``planes`` (M, 4, 3) with what surfaces (M, 4, 3) in the map are along rays in a sensor's frame.
+def planes_in_cam(surfaces: Surfaces, ids: NDArray[np.int64], map_from_cam: Pose, planes: NDArray[Any]) -> None:
+    """Fill ``planes`` (M, 4, 3) with what the surfaces ``ids`` are along rays in a sensor's frame.
 
-    ``map_from_cam`` (3, 3) turns the rays, ``centre`` (3,) is where they start.
+    The pose may be mirrored. Surfaces that are turned away or seen from their edge get zeros, which nothing hits.
+    """
+    # Of one memory layout, whatever the caller's: each layout would be compiled again.
+    rotation, centre = (
+        np.array(a, np.float64, order="C") for a in (map_from_cam.rotation, map_from_cam.translation_m)
+    )
+    _fill_planes(surfaces.corners_in_map[ids], surfaces.two_sided[ids], rotation, centre, planes)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _fill_planes(corners: Any, two_sided: Any, map_from_cam: Any, centre: Any, planes: Any) -> None:
+    """The same for corners (M, 4, 3); ``map_from_cam`` (3, 3) turns the rays, ``centre`` (3,) is where they start.
 
     A point of a surface is P + u e1 + v e2 with its first corner P and two of its edges; P. Heckbert,
     "Fundamentals of Texture Mapping and Image Warping", 1989, section 2.2.3, gives the texture from u and v.
-    Surfaces that are turned away or seen from their edge get zeros, which nothing hits.
     """
     for m in range(len(corners)):
         planes[m] = 0.0

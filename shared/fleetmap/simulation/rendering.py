@@ -87,13 +87,12 @@ def cast_rays(scene: Scene, map_from_sensor: Pose, directions: Array, max_range_
     and walls from their front only, as by :func:`render`.
     """
     surfaces, centre = scene.surfaces, map_from_sensor.translation_m
-    rays = np.asarray(directions / np.linalg.norm(directions, axis=1, keepdims=True), dtype=np.float64)
+    rays = np.ascontiguousarray(directions / np.linalg.norm(directions, axis=1, keepdims=True), dtype=np.float64)
     ids, nearest_m = surfaces_in_cone(
         surfaces, centre, map_from_sensor.rotation[:, 2], widest_rad=np.pi, farthest_m=max_range_m
     )
     planes = np.empty((len(ids), 4, 3))
-    corners, two_sided = surfaces.corners_in_map[ids], surfaces.two_sided[ids]
-    planes_in_cam(corners, two_sided, map_from_sensor.rotation, centre, planes)
+    planes_in_cam(surfaces, ids, map_from_sensor, planes)
     textures, opacities = surfaces.texture_indices[ids], scene.atlas.packed_opacities
     return np.asarray(first_hits(planes, nearest_m, textures, opacities, rays, float(max_range_m)))
 

@@ -39,7 +39,7 @@ class View:
     table: RayTable
     samples_px: NDArray[np.float32]  # (K, 2) x and y beside the pixel's centre
     ids: NDArray[np.int64]  # (M,) the surfaces that may be in view, nearest first
-    planes: NDArray[np.float32]  # (1 or B, M, 4, 3) as in visibility.planes_in_cam, for all bands of rows or each
+    planes: NDArray[np.float32]  # (1 or B, M, 4, 3) as in planes.planes_in_cam, for all bands of rows or each
     seen: NDArray[np.int32]  # (B, T, K, TILE_PIXELS) indices into ``ids``, or NOTHING
     nearest: NDArray[np.float32]  # (B, T, K, TILE_PIXELS) inverse distance in 1/m; 0 for the sky
 
@@ -57,10 +57,9 @@ def view_of(scene: Scene, table: RayTable, poses: list[Pose], samples_px: Array)
         smallest_rad=_SMALLEST_RADIUS_PX * table.finest_rad,
         slack_m=float(np.linalg.norm(moves_m, axis=1).max()),
     )
-    corners, two_sided = surfaces.corners_in_map[ids], surfaces.two_sided[ids]
     planes = np.empty((len(poses), len(ids), 4, 3), dtype=np.float32)
     for pose, planes_of_pose in zip(poses, planes, strict=True):
-        planes_in_cam(corners, two_sided, pose.rotation, pose.translation_m, planes_of_pose)
+        planes_in_cam(surfaces, ids, pose, planes_of_pose)
     samples = samples_px.astype(np.float32)
     seen, nearest = see(planes, surfaces.texture_indices[ids], scene.atlas.packed_opacities, table, samples)
     return View(table, samples, ids, planes, seen, nearest)

@@ -103,7 +103,7 @@ def wet_the_ground(
     blurred = np.asarray(cv2.GaussianBlur(mirror, (0, 0), sigmaX=_BLUR_PX[0], sigmaY=_BLUR_PX[1]), np.float32)
     is_ground, heights_m = _ground(surfaces, view.ids, map_from_cam.translation_m, plane)
     # One pose serves the puddles' places also while a shutter rolls: they are off by centimetres.
-    pose = (map_from_cam.rotation, map_from_cam.translation_m)
+    pose = tuple(np.array(a, np.float64, order="C") for a in (map_from_cam.rotation, map_from_cam.translation_m))
     _mirror_in_ground(
         light, blurred, np.float32(wetness), is_ground, heights_m, view.seen, view.nearest, view.table.rays, pose
     )
