@@ -6,12 +6,14 @@ its first directory points to the Exif directory with DateTimeOriginal, SubSecTi
 
 from __future__ import annotations
 
+import re
 import struct
 
 from fleetmap.drives.image_folder_times import time_ns
 
 _EXIF_DIRECTORY, _TAKEN, _TAKEN_OFFSET, _TAKEN_FRACTION = 0x8769, 0x9003, 0x9011, 0x9291
 _ASCII, _LONG = 2, 4  # types of entries
+_DATE_AND_TIME = re.compile(r"\d{4}:\d\d:\d\d \d\d:\d\d:\d\d")
 _APP1, _START_OF_SCAN = 0xE1, 0xDA
 
 
@@ -25,6 +27,8 @@ def time_taken_ns(jpeg: bytes) -> int | None:
         first = _entries(tiff, order, struct.unpack_from(order + "I", tiff, 4)[0])
         taken = _entries(tiff, order, int(first[_EXIF_DIRECTORY]))
         fraction, offset = str(taken.get(_TAKEN_FRACTION, "")), str(taken.get(_TAKEN_OFFSET, ""))
+        if _DATE_AND_TIME.fullmatch(str(taken[_TAKEN])) is None:
+            return None
         return time_ns(str(taken[_TAKEN]) + (f".{fraction}" if fraction else "") + offset)
     except (KeyError, ValueError, struct.error):
         return None
@@ -51,5 +55,6 @@ def _entries(tiff: bytes, order: str, at: int) -> dict[int, int | str]:
             entries[tag] = value
         elif kind == _ASCII:
             start = value if size > 4 else at + 2 + 12 * index + 8
-            entries[tag] = tiff[start : start + size].split(b"\x00")[0].decode("ascii").strip()
+            (text,) = struct.unpack_from(f"{size}s", tiff, start)
+            entries[tag] = text.split(b"\x00")[0].decode("ascii").strip()
     return entries

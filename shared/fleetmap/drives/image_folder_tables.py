@@ -163,7 +163,10 @@ def read_fixes(table: Table, defaults: PositionDefaults) -> list[GnssFix]:
         raise DriveError(f"{table.path} has easting and northing; say of which UTM zone, such as --epsg 32632")
     grid = UtmGrid(defaults.epsg) if is_projected and defaults.epsg is not None else None
     fixes: list[GnssFix] = []
+    needed = 1 + max(table.columns[role] for role in ("time", *position))
     for line, row in table.rows:
+        if len(row) < needed:
+            raise DriveError(f"{table.path} line {line} has {len(row)} fields instead of {len(table.header)}")
         if not any(table.cell(row, role) for role in position):
             continue
         fix = _fix(table, line, row, grid, defaults)
