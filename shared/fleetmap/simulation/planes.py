@@ -9,6 +9,7 @@ Coordinates", Graphics Hardware 1997.)
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -72,21 +73,25 @@ def _distances_in_cone(corners: Any, centre: Any, axis: Any, limits: Any) -> Any
     return distances
 
 
-def planes_in_cam(surfaces: Surfaces, ids: NDArray[np.int64], map_from_cam: Pose, planes: NDArray[Any]) -> None:
-    """Fill ``planes`` (M, 4, 3) with what the surfaces ``ids`` are along rays in a sensor's frame.
+def planes_in_cam(
+    surfaces: Surfaces, ids: NDArray[np.int64], poses: Sequence[Pose], dtype: type[np.floating[Any]] = np.float32
+) -> NDArray[Any]:
+    """Planes (P, M, 4, 3): what the surfaces ``ids`` are along rays in a sensor's frame, at each ``map_from_cam``.
 
-    The pose may be mirrored. Surfaces that are turned away or seen from their edge get zeros, which nothing hits.
+    A pose may be mirrored. Surfaces that are turned away or seen from their edge get zeros, which nothing hits.
     """
-    # Of one memory layout, whatever the caller's: each layout would be compiled again.
-    rotation, centre = (
-        np.array(a, np.float64, order="C") for a in (map_from_cam.rotation, map_from_cam.translation_m)
-    )
-    _fill_planes(surfaces.corners_in_map[ids], surfaces.two_sided[ids], rotation, centre, planes)
+    corners, two_sided = surfaces.corners_in_map[ids], surfaces.two_sided[ids]
+    planes = np.empty((len(poses), len(ids), 4, 3), dtype=dtype)
+    for pose, planes_of_pose in zip(poses, planes, strict=True):
+        # Of one memory layout, whatever the caller's: each layout would be compiled again.
+        rotation, centre = (np.array(a, np.float64, order="C") for a in (pose.rotation, pose.translation_m))
+        _fill_planes(corners, two_sided, rotation, centre, planes_of_pose)
+    return planes
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fill_planes(corners: Any, two_sided: Any, map_from_cam: Any, centre: Any, planes: Any) -> None:
-    """The same for corners (M, 4, 3); ``map_from_cam`` (3, 3) turns the rays, ``centre`` (3,) is where they start.
+    """Of corners (M, 4, 3) at one pose; ``map_from_cam`` (3, 3) turns the rays, ``centre`` (3,) is their start.
 
     A point of a surface is P + u e1 + v e2 with its first corner P and two of its edges; P. Heckbert,
     "Fundamentals of Texture Mapping and Image Warping", 1989, section 2.2.3, gives the texture from u and v.

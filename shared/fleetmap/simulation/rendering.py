@@ -91,8 +91,7 @@ def cast_rays(scene: Scene, map_from_sensor: Pose, directions: Array, max_range_
     ids, nearest_m = surfaces_in_cone(
         surfaces, centre, map_from_sensor.rotation[:, 2], widest_rad=np.pi, farthest_m=max_range_m
     )
-    planes = np.empty((len(ids), 4, 3))
-    planes_in_cam(surfaces, ids, map_from_sensor, planes)
+    (planes,) = planes_in_cam(surfaces, ids, (map_from_sensor,), np.float64)
     textures, opacities = surfaces.texture_indices[ids], scene.atlas.packed_opacities
     return np.asarray(first_hits(planes, nearest_m, textures, opacities, rays, float(max_range_m)))
 

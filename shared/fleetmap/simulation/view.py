@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fleetmap.geometry import Pose, rotation_angle_rad
 from fleetmap.simulation.atlas import Atlas
-from fleetmap.simulation.planes import planes_in_cam, surfaces_in_cone
+from fleetmap.simulation.planes import INVERSE, planes_in_cam, surfaces_in_cone
 from fleetmap.simulation.rays import RayTable
 from fleetmap.simulation.surfaces import Surfaces
 from fleetmap.simulation.visibility import see
@@ -45,7 +45,7 @@ class View:
 
 
 def view_of(scene: Scene, table: RayTable, poses: list[Pose], samples_px: Array) -> View:
-    """What a camera sees from a pose ``map_from_cam``, or from one for each of its bands of rows."""
+    """What a camera sees from a pose ``map_from_cam``, or from one for each of its bands, on a straight way."""
     surfaces, middle = scene.surfaces, poses[len(poses) // 2]
     turn_rad = max(float(rotation_angle_rad(middle.rotation.T @ pose.rotation)) for pose in (poses[0], poses[-1]))
     moves_m = [pose.translation_m - middle.translation_m for pose in (poses[0], poses[-1])]
@@ -57,9 +57,10 @@ def view_of(scene: Scene, table: RayTable, poses: list[Pose], samples_px: Array)
         smallest_rad=_SMALLEST_RADIUS_PX * table.finest_rad,
         slack_m=float(np.linalg.norm(moves_m, axis=1).max()),
     )
-    planes = np.empty((len(poses), len(ids), 4, 3), dtype=np.float32)
-    for pose, planes_of_pose in zip(poses, planes, strict=True):
-        planes_in_cam(surfaces, ids, pose, planes_of_pose)
+    # What is turned away from both ends of a straight way is turned away all along.
+    at_ends = planes_in_cam(surfaces, ids, (poses[0], poses[-1]))
+    ids = ids[at_ends[:, :, INVERSE].any(axis=(0, 2))]
+    planes = planes_in_cam(surfaces, ids, poses)
     samples = samples_px.astype(np.float32)
     seen, nearest = see(planes, surfaces.texture_indices[ids], scene.atlas.packed_opacities, table, samples)
     return View(table, samples, ids, planes, seen, nearest)
