@@ -28,6 +28,7 @@ Array = NDArray[np.float64]
 Rng = np.random.Generator
 
 SHORTEST_CIRCUIT_M = 140.0
+MARKERS_LEFT_M = (-4.55, 8.05)  # just behind either kerb, in the path's offsets
 _BLOCK_M = 100.0  # about, from street to street
 _BEYOND_M = 95.0  # streets reach so far beyond the outermost crossings
 _LINED_M = 72.0  # houses, trees and cars stand so far from the path
@@ -50,7 +51,7 @@ def lay_city(rng: Rng, builder: SurfaceBuilder, palette: Palette, length_m: floa
     """A circuit of a given length around some blocks of a city."""
     path, grid = lay_circuit(rng, length_m, steepest=0.08)
     kerbs = build_blocks(rng, builder, palette, path, grid, alike=alike)
-    return Plot(path, kerbs, marker_places(path, 45.0, (-5.3, 8.8)))
+    return Plot(path, kerbs, marker_places(path, 40.0, MARKERS_LEFT_M, grid.is_kerbside))
 
 
 def lay_facades(rng: Rng, builder: SurfaceBuilder, palette: Palette, length_m: float) -> Plot:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.simulation import furniture, houses
-from fleetmap.simulation.blocks import Street, line_street
+from fleetmap.simulation.blocks import MARKERS_LEFT_M, Street, line_street
 from fleetmap.simulation.furniture import TreePaint
 from fleetmap.simulation.ground import STREET_HALF_M, StreetGrid, lay_ground
 from fleetmap.simulation.palette import Palette
@@ -80,7 +80,7 @@ def _lay_road(
         kerbs += line_street(village_rng, field_rng, builder, palette, street)
     for low, high in fields:
         _till(field_rng, builder, palette, GridLine(path.terrain, (low, 0.0), along_v=False), high - low)
-    return Plot(path, kerbs, marker_places(path, 45.0, (-4.8, 8.3)), tunnels_m)
+    return Plot(path, kerbs, marker_places(path, 40.0, MARKERS_LEFT_M), tunnels_m)
 
 
 def _villages_and_fields(

@@ -35,6 +35,14 @@ class StreetGrid:
     start_uv: tuple[float, float]
     end_uv: tuple[float, float]  # streets reach from start to end
 
+    def is_kerbside(self, places_uv: Array) -> NDArray[np.bool_]:
+        """Which of places (N, 2) are in one street only, not where another crosses it."""
+        inside = [
+            (np.abs(places_uv[:, i, None] - axes) < STREET_HALF_M).any(axis=1)
+            for i, axes in enumerate((self.columns_m, self.rows_m))
+        ]
+        return np.asarray(inside[0] != inside[1])
+
 
 @dataclass(frozen=True)
 class _Interval:

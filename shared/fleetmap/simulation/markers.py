@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 DICTIONARY = "DICT_5X5_250"
 _MODULES = 7  # of the black square's side: five of the code, and its rim
 _SIDE_M, _BOARD_M = 0.56, 0.72  # the board shows a white module around the square
-_MIDDLE_ABOVE_M, _BOARD_PX = 2.3, 320
+_MIDDLE_ABOVE_M, _BOARD_PX = 2.75, 320  # above vans
 _TOWARDS_ROAD_RAD = 0.15
 _MOST_MARKERS = 250
 

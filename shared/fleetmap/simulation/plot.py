@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,11 +54,24 @@ class Plot:
     tunnels_m: tuple[tuple[float, float], ...] = ()  # stretches along the path
 
 
-def marker_places(path: RoadPath, every_m: float, lefts_m: tuple[float, float]) -> list[tuple[float, float]]:
-    """Places (s, left) on alternate sides, where the path is straight."""
-    s = np.arange(16.0, path.length_m - 5.0, every_m)
-    straight = np.abs(path.heading_rad(s + 12.0) - path.heading_rad(s - 12.0)) < 1e-3
-    return [(float(place), lefts_m[i % 2]) for i, place in enumerate(s[straight])]
+def marker_places(
+    path: RoadPath,
+    every_m: float,
+    lefts_m: tuple[float, float],
+    is_free: Callable[[Array], NDArray[np.bool_]] | None = None,
+) -> list[tuple[float, float]]:
+    """Places (s, left) on alternate sides where the path is straight and the grid's places (N, 2) are free."""
+    s = np.arange(5.0, path.length_m, 1.0)
+    good = np.abs(path.heading_rad(s + 8.0) - path.heading_rad(s - 4.0)) < 1e-3
+    free = [
+        good if is_free is None else good & is_free(np.stack(path.grid_at(s, left), axis=-1)) for left in lefts_m
+    ]
+    places: list[tuple[float, float]] = []
+    for index, at in enumerate(s.tolist()):
+        side = len(places) % 2
+        if free[side][index] and (not places or at - places[-1][0] >= every_m):
+            places.append((at, lefts_m[side]))
+    return places
 
 
 def under_roof(s_m: Array | float, tunnels_m: tuple[tuple[float, float], ...]) -> Array:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.simulation import furniture, textures
-from fleetmap.simulation.blocks import Street, build_row, lay_circuit
+from fleetmap.simulation.blocks import MARKERS_LEFT_M, Street, build_row, lay_circuit
 from fleetmap.simulation.furniture import TreePaint
 from fleetmap.simulation.ground import STREET_HALF_M, ground_corners
 from fleetmap.simulation.palette import Palette
@@ -31,7 +31,7 @@ def lay_open(rng: Rng, builder: SurfaceBuilder, palette: Palette, length_m: floa
     _pave(rng, builder, palette, path, low, high)
     _surround(rng, builder, palette, path, low, high)
     _light(rng, builder, palette, path, low, high)
-    return Plot(path, _bays(path, low, high), marker_places(path, 40.0, (-5.3, 8.8)))
+    return Plot(path, _bays(path, low, high), marker_places(path, 40.0, MARKERS_LEFT_M))
 
 
 def _pave(rng: Rng, builder: SurfaceBuilder, palette: Palette, path: RoadPath, low: Array, high: Array) -> None:

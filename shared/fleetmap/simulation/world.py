@@ -35,7 +35,7 @@ Array = NDArray[np.float64]
 Rng = np.random.Generator
 
 WORLD_KINDS = ("city", "straight", "tunnel", "open", "facades", "street")
-LONGEST_M = 3200.0
+LONGEST_M, MOST_CARS_PER_KM = 3200.0, 150.0
 _HORIZON_M = 150.0  # from the path to the ring of hills, at least
 
 
@@ -122,7 +122,7 @@ def build_world(
         lat_deg, lon_deg, height_m: the site (ellipsoidal height).
 
     Raises:
-        InputError: no such kind of world, a length that cannot be built, or a site outside UTM.
+        InputError: no such kind of world, a length or a number that makes no sense, or a site outside UTM.
     """
     if kind not in WORLD_KINDS:
         raise InputError(f"there is no world of kind {kind!r}; choose from {', '.join(WORLD_KINDS)}")
@@ -132,6 +132,11 @@ def build_world(
     if not SHORTEST_CIRCUIT_M <= length_m <= LONGEST_M:
         raise InputError(
             f"a world of {length_m} m cannot be built; give {SHORTEST_CIRCUIT_M:.0f} to {LONGEST_M:.0f} m"
+        )
+    if not (0.0 <= parked_cars_changed <= 1.0 and 0.0 <= moving_cars_per_km <= MOST_CARS_PER_KM):
+        raise InputError(
+            f"{parked_cars_changed} is no share of the parked cars, or {moving_cars_per_km} moving cars per km"
+            f" do not fit; give 0 to 1, and 0 to {MOST_CARS_PER_KM:.0f}"
         )
     anchor = anchor_at(lat_deg, lon_deg, height_m)
     plan_rng, far_rng = np.random.default_rng(seed).spawn(2)
