@@ -34,7 +34,7 @@ def test_a_report_names_topics_frames_calibration_gnss_antenna_and_length(fleetm
         "1.0 s from 2022-04-15T05:20:00Z",
         "/camera/camera_info            11  sensor_msgs/msg/CameraInfo",
         "11 on /camera/image/compressed, 64x48 pixels, 10.00 Hz, longest gap 0.10 s",
-        "fx 50 fy 51 cx 31.5 cy 23.5, distortion -0.3 0.1 0.001 -0.002 0.01",
+        "fx 50 fy 51 cx 31.5 cy 23.5, distortion plumb_bob -0.3 0.1 0.001 -0.002 0.01",
         "11 valid fixes of 11 on /gnss/fix, 10.00 Hz",
         "reported sigma 0.05 m horizontal, 0.05 m vertical",
         "11 m (from GNSS)",

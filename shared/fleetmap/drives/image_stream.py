@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 from fleetmap.drives.image_codec import Image, decode_compressed
@@ -24,8 +24,12 @@ class DecodedImage:
     image: Image
 
 
-def decoded_images(messages: Iterable[ImageMessage], source: str) -> Iterator[DecodedImage]:
-    """Decode images as they are asked for; ``source`` is what to call the topic in errors.
+def decoded_images(
+    messages: Iterable[ImageMessage], source: str, wanted: Callable[[int], bool] = lambda stamp_ns: True
+) -> Iterator[DecodedImage]:
+    """Decode the images with wanted stamps as they are asked for; ``source`` is what to call the topic in errors.
+
+    Pictures that are not wanted cost nothing; those of a video are decoded all the same.
 
     Raises:
         DriveError: an image that cannot be decoded.
@@ -34,18 +38,22 @@ def decoded_images(messages: Iterable[ImageMessage], source: str) -> Iterator[De
     for number, message in enumerate(messages):
         try:
             match message.picture:
+                case CompressedPicture() | RawPicture() if not wanted(message.stamp_ns):
+                    continue
                 case CompressedPicture(data, recorded_format):
                     yield DecodedImage(number, message.stamp_ns, decode_compressed(data, recorded_format))
                 case RawPicture() as picture:
                     yield DecodedImage(number, message.stamp_ns, decode_raw(picture))
                 case VideoPicture(data, recorded_format):
                     video = video or _VideoStream(recorded_format, source)
-                    yield from video.decode(number, message.stamp_ns, data)
+                    for decoded in video.decode(number, message.stamp_ns, data):
+                        if wanted(decoded.stamp_ns):
+                            yield decoded
         except ValueError as error:
             name = image_name(number, source, message.stamp_ns)
             raise DriveError(f"{name} cannot be decoded: {error}") from error
     if video is not None:
-        yield from video.finish()
+        yield from (decoded for decoded in video.finish() if wanted(decoded.stamp_ns))
 
 
 def image_name(number: int, source: str, stamp_ns: int) -> str:

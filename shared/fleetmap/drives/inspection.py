@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from fleetmap.camera import Camera
-from fleetmap.drive import GnssFix
-from fleetmap.drives.mcap_file import McapFile
+from fleetmap.drive import Antenna, GnssFix
+from fleetmap.drives.mcap_drive import McapDrive, read_fixes
+from fleetmap.drives.mcap_file import McapFile, Topic
 from fleetmap.drives.opening import find_mcap
-from fleetmap.drives.ros2_reader import Ros2Drive, read_fixes
 from fleetmap.drives.topic_choice import choose_gnss_topic
+from fleetmap.drives.topic_reading import kind_of
 from fleetmap.errors import FleetmapError, InputError
 from fleetmap.geodesy import UtmGrid
 
@@ -26,6 +27,8 @@ class TopicInfo:
     name: str
     message_type: str
     message_count: int
+    rate_hz: float | None  # over the time of the images
+    use: str | None  # what fleetmap reads from it; None for a type that it does not know
 
 
 @dataclass(frozen=True)
@@ -79,7 +82,27 @@ class DriveInfo:
     missing: tuple[str, ...]  # one line each; empty for a recording that can be mapped
 
 
+@dataclass(frozen=True)
+class DriveContents:
+    """An opened recording, for those who look further into it."""
+
+    info: DriveInfo
+    drive: McapDrive | None  # None without images
+    stamps_ns: tuple[int, ...]  # of the images in the order of the recording
+    fixes: tuple[GnssFix, ...]
+    antenna: Antenna | None  # None without images or fixes
+
+
 def inspect_drive(path: Path, *, image_topic: str | None = None, gnss_topic: str | None = None) -> DriveInfo:
+    """What a recording holds, and what it lacks.
+
+    Raises:
+        DriveError: it cannot be read at all, or a topic that was asked for is not there.
+    """
+    return look_through(path, image_topic=image_topic, gnss_topic=gnss_topic).info
+
+
+def look_through(path: Path, *, image_topic: str | None = None, gnss_topic: str | None = None) -> DriveContents:
     """Look through a recording; what it lacks is listed, not raised.
 
     Raises:
@@ -90,30 +113,39 @@ def inspect_drive(path: Path, *, image_topic: str | None = None, gnss_topic: str
     missing: list[str] = []
     fixes, gnss = _look_at_gnss(mcap, gnss_topic, missing)
     drive = _try_open(file, image_topic, gnss_topic, missing)
-    stamps_ns = [fix.stamp_ns for fix in fixes]
+    image_stamps_ns: list[int] = []
     images, camera, antenna = None, None, None
     if drive is not None:
-        stamps_ns = drive.frame_stamps_ns()
+        image_stamps_ns = drive.frame_stamps_ns()
         camera = _look_at_camera(drive, missing)
-        images = _look_at_images(drive, camera, stamps_ns, missing)
+        images = _look_at_images(drive, camera, image_stamps_ns, missing)
         antenna = _look_at_antenna(drive, missing) if gnss else None
-    return DriveInfo(
+    stamps_ns = image_stamps_ns or [fix.stamp_ns for fix in fixes]
+    duration_s = (max(stamps_ns) - min(stamps_ns)) * 1e-9 if stamps_ns else None
+    info = DriveInfo(
         path=str(file),
         size_bytes=file.stat().st_size,
-        topics=tuple(TopicInfo(t.name, t.message_type, t.message_count) for t in mcap.topics.values()),
+        topics=tuple(_topic_info(topic, duration_s) for topic in mcap.topics.values()),
         images=images,
         camera=camera,
         gnss=gnss,
-        antenna=antenna,
+        antenna=_antenna_info(antenna) if antenna else None,
         start_ns=min(stamps_ns, default=None),
-        duration_s=(max(stamps_ns) - min(stamps_ns)) * 1e-9 if stamps_ns else None,
+        duration_s=duration_s,
         missing=tuple(missing),
     )
+    return DriveContents(info, drive, tuple(image_stamps_ns), tuple(fixes), antenna)
 
 
-def _try_open(file: Path, image_topic: str | None, gnss_topic: str | None, missing: list[str]) -> Ros2Drive | None:
+def _topic_info(topic: Topic, duration_s: float | None) -> TopicInfo:
+    rate_hz = (topic.message_count - 1) / duration_s if duration_s and topic.message_count > 1 else None
+    kind = kind_of(topic)
+    return TopicInfo(topic.name, topic.message_type, topic.message_count, rate_hz, kind.name if kind else None)
+
+
+def _try_open(file: Path, image_topic: str | None, gnss_topic: str | None, missing: list[str]) -> McapDrive | None:
     try:
-        return Ros2Drive(file, image_topic=image_topic, gnss_topic=gnss_topic)
+        return McapDrive(file, image_topic=image_topic, gnss_topic=gnss_topic)
     except InputError as error:
         if image_topic is not None:
             raise
@@ -121,7 +153,7 @@ def _try_open(file: Path, image_topic: str | None, gnss_topic: str | None, missi
         return None
 
 
-def _look_at_camera(drive: Ros2Drive, missing: list[str]) -> Camera | None:
+def _look_at_camera(drive: McapDrive, missing: list[str]) -> Camera | None:
     try:
         return drive.camera
     except InputError as error:
@@ -130,7 +162,7 @@ def _look_at_camera(drive: Ros2Drive, missing: list[str]) -> Camera | None:
 
 
 def _look_at_images(
-    drive: Ros2Drive, camera: Camera | None, stamps_ns: list[int], missing: list[str]
+    drive: McapDrive, camera: Camera | None, stamps_ns: list[int], missing: list[str]
 ) -> ImagesInfo:
     try:
         height, width = drive.decode_first_image().shape
@@ -186,7 +218,7 @@ def _gnss_info(mcap: McapFile, topic: str, fixes: list[GnssFix]) -> GnssInfo:
     )
 
 
-def _look_at_antenna(drive: Ros2Drive, missing: list[str]) -> AntennaInfo | None:
+def _look_at_antenna(drive: McapDrive, missing: list[str]) -> Antenna | None:
     try:
         antenna = drive.antenna()
     except FleetmapError as error:
@@ -194,6 +226,10 @@ def _look_at_antenna(drive: Ros2Drive, missing: list[str]) -> AntennaInfo | None
         return None
     if antenna.source == "assumed at the camera":
         missing.append("antenna: no static transform says where it is; give --antenna-offset X,Y,Z when mapping")
+    return antenna
+
+
+def _antenna_info(antenna: Antenna) -> AntennaInfo:
     x, y, z = (float(value) for value in antenna.position_in_cam_m)
     return AntennaInfo((x, y, z), antenna.source)
 

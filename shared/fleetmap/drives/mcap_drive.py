@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Set
 from functools import cached_property
 from pathlib import Path
 
@@ -93,9 +93,20 @@ class McapDrive:
             DriveError: an image that cannot be decoded, or that is not later than the one before.
             CalibrationError: no calibration, or an image whose size contradicts it.
         """
+        return self._frames(lambda stamp_ns: True)
+
+    def frames_at(self, stamps_ns: Set[int]) -> Iterator[Frame]:
+        """The images with some stamps; the others are not decoded, unless a video needs them.
+
+        Raises:
+            DriveError, CalibrationError: see ``frames``.
+        """
+        return self._frames(stamps_ns.__contains__)
+
+    def _frames(self, wanted: Callable[[int], bool]) -> Iterator[Frame]:
         camera = self.camera
         stamp_before_ns: int | None = None
-        for decoded in self._decoded_images():
+        for decoded in decoded_images(self._image_messages(), self._source, wanted):
             self._check_order(decoded, stamp_before_ns)
             self._check_size(decoded, camera)
             stamp_before_ns = decoded.stamp_ns
@@ -103,7 +114,7 @@ class McapDrive:
 
     def decode_first_image(self) -> Image:
         """The first image, also of a recording without calibration. Raises DriveError if it cannot be decoded."""
-        first = next(self._decoded_images(), None)
+        first = next(decoded_images(self._image_messages(), self._source), None)
         if first is None:
             raise DriveError(f"{self._source} holds no image")
         return first.image
@@ -196,9 +207,6 @@ class McapDrive:
 
     def _image_messages(self) -> Iterator[ImageMessage]:
         return read_values(self.mcap, IMAGES, self.image_topic)
-
-    def _decoded_images(self) -> Iterator[DecodedImage]:
-        return decoded_images(self._image_messages(), self._source)
 
     def _check_order(self, decoded: DecodedImage, stamp_before_ns: int | None) -> None:
         if stamp_before_ns is not None and decoded.stamp_ns <= stamp_before_ns:
