@@ -19,6 +19,7 @@ from fleetmap.errors import FleetmapError
 VERBS: dict[str, tuple[str, str, str]] = {
     "demo": ("demo:demo", "Simulate, map, serve, localise and judge one short street.", "all"),
     "convert": ("convert:convert", "Turn a public data set's folder into an MCAP recording.", "recordings"),
+    "simulate": ("simulate:simulate", "Simulate a drive with the truth known.", "all"),
     "info": ("info:info", "Say what a recording holds and what it lacks.", "recordings"),
     "map": ("map:map_", "Turn a survey drive into a map anchored in UTM.", "mapper"),
     "serve": ("serve:serve", "Run the map server (Zenoh and HTTP).", "server"),

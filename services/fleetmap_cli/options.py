@@ -27,5 +27,25 @@ class Numbers(click.ParamType[tuple[float, ...]]):
         return numbers
 
 
+class Gap(click.ParamType[tuple[float, float]]):
+    """A stretch of time such as ``11:10``."""
+
+    name = "START_S:LENGTH_S"
+
+    def convert(
+        self, value: object, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[float, float]:
+        """Start and length, or click's usage error (exit code 2) naming what was expected."""
+        if isinstance(value, tuple):
+            return value
+        try:
+            start_s, length_s = (float(field) for field in str(value).split(":"))
+        except ValueError:
+            start_s = length_s = -1.0
+        if not (0.0 <= start_s < float("inf") and 0.0 < length_s < float("inf")):
+            self.fail(f"'{value}' is not {self.name}: two numbers of seconds with a colon between", param, ctx)
+        return start_s, length_s
+
+
 XYZ = Numbers("X,Y,Z")
 LAT_LON = Numbers("LAT,LON")

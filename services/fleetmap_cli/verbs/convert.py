@@ -19,7 +19,7 @@ from fleetmap.drives.kitti_raw import convert_kitti_raw
 from fleetmap.drives.local_poses import Site
 from fleetmap.drives.tum_rgbd import convert_tum_rgbd
 from fleetmap.gnss import GNSS_ERROR_MODELS
-from fleetmap_cli.options import XYZ, Numbers
+from fleetmap_cli.options import XYZ, Gap, Numbers
 from fleetmap_cli.progress import StageBar
 
 _FOLDER = click.argument("folder", type=click.Path(path_type=Path))
@@ -31,25 +31,6 @@ _SITE = click.option(
     help="Where on Earth to take the room's origin to be (ellipsoidal height); its x axis points to grid east.",
 )
 _FORCE = click.option("--force", is_flag=True, help="Replace an existing OUT.mcap.")
-
-
-class _Gap(click.ParamType[tuple[float, float]]):
-    """A stretch of time such as ``11:10``."""
-
-    name = "START_S:LENGTH_S"
-
-    def convert(
-        self, value: object, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[float, float]:
-        if isinstance(value, tuple):
-            return value
-        try:
-            start_s, length_s = (float(field) for field in str(value).split(":"))
-        except ValueError:
-            start_s = length_s = -1.0
-        if not (0.0 <= start_s < float("inf") and 0.0 < length_s < float("inf")):
-            self.fail(f"'{value}' is not {self.name}: two numbers of seconds with a colon between", param, ctx)
-        return start_s, length_s
 
 
 class _Time(click.ParamType[int]):
@@ -73,7 +54,7 @@ def _gnss_options(command: Callable[..., None]) -> Callable[..., None]:
             help="Make GNSS fixes from the reference with this receiver's errors. Without it there are none.",
         ),
         click.option("--gnss-interval-s", type=float, help="Seconds between fixes.  [default: 0.1]"),
-        click.option("--gnss-gap", type=_Gap(), help="A stretch without fixes, in seconds since the first image."),
+        click.option("--gnss-gap", type=Gap(), help="A stretch without fixes, in seconds since the first image."),
         click.option(
             "--antenna-in-camera",
             type=XYZ,

@@ -19,7 +19,7 @@ from fleetmap.trajectory import Trajectory
 Array = NDArray[np.float64]
 
 START_NS = 1_700_000_000_000_000_000  # 2023-11-14T22:13:20Z
-FASTEST_MPS, HIGHEST_RATE_HZ = 70.0, 1000.0
+FASTEST_MPS, HIGHEST_RATE_HZ = 70.0, 200.0
 
 _STEP_M = 1.0  # between the points of the lane that the car's line goes through, smoothly
 _HALF_WHEELBASE_M = 1.3
@@ -84,14 +84,21 @@ def drive_along(
 
 
 def image_stamps_ns(motion: Motion, rate_hz: float) -> NDArray[np.int64]:
-    """When images are taken: from the start on, evenly.
+    """When images are taken: from the start on, evenly. Raises InputError for a rate that makes no sense."""
+    require_rate(rate_hz)
+    return motion.stamps_ns(rate_hz)
 
-    Raises:
-        InputError: a rate that makes no sense.
-    """
+
+def require_rate(rate_hz: float) -> None:
+    """Raise InputError for a rate at which no images can be taken."""
     if not 0.0 < rate_hz <= HIGHEST_RATE_HZ:
         raise InputError(f"{rate_hz:g} images/s make no sense; give more than 0, at most {HIGHEST_RATE_HZ:g}")
-    return motion.stamps_ns(rate_hz)
+
+
+def require_speed(speed_mps: float) -> None:
+    """Raise InputError for a speed at which no car drives."""
+    if not 0.0 < speed_mps <= FASTEST_MPS:
+        raise InputError(f"a speed of {speed_mps:g} m/s makes no sense; give more than 0, at most {FASTEST_MPS:g}")
 
 
 def plan_motion(
@@ -118,11 +125,9 @@ def plan_motion(
         InputError: a speed that makes no sense, or a stretch that ends before it starts.
     """
     stop_m = road.length_m if end_m is None else end_m
-    if not (0.0 < speed_mps <= FASTEST_MPS and start_m < stop_m < np.inf and np.isfinite(lane_offset_m)):
-        raise InputError(
-            f"cannot drive from {start_m:g} m to {stop_m:g} m at {speed_mps:g} m/s;"
-            f" the speed is more than 0 and at most {FASTEST_MPS:g} m/s, and a drive ends after it starts"
-        )
+    require_speed(speed_mps)
+    if not (-np.inf < start_m < stop_m < np.inf and np.isfinite(lane_offset_m)):
+        raise InputError(f"cannot drive from {start_m:g} m to {stop_m:g} m, {lane_offset_m:g} m to the left")
     line = _Line(road.path, lane_offset_m, start_m, stop_m)
     grid_speed = speed_mps * grid_scale_at(road.anchor)
     seconds, s, lengths_m = _timetable(line, start_m, stop_m, grid_speed, slow_in_bends)

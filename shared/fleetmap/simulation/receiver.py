@@ -19,6 +19,7 @@ from fleetmap.simulation.world import World
 Array = NDArray[np.float64]
 
 _PATH_STEP_M, _PORTAL_M = 1.0, 7.0
+_LEAST_INTERVAL_S = 0.001
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,10 @@ class Receiver:
         if self.model not in GNSS_ERROR_MODELS:
             raise InputError(
                 f"there is no GNSS error model {self.model!r}; choose from {', '.join(GNSS_ERROR_MODELS)}"
+            )
+        if not self.interval_s >= _LEAST_INTERVAL_S:
+            raise InputError(
+                f"GNSS interval of {self.interval_s} s makes no sense; give at least {_LEAST_INTERVAL_S} s"
             )
         if not abs(self.clock_offset_s) <= 10.0:
             raise InputError(f"a GNSS clock that is {self.clock_offset_s} s off makes no sense; give at most 10 s")

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from fleetmap.drives.conversion import reference_path
 from fleetmap.drives.image_codec import encode_image
 from fleetmap.drives.ros2_writer import DriveWriter
 from fleetmap.files import atomic_path, refuse_existing, write_text_atomically
@@ -65,7 +66,7 @@ def record_drive(
         StorageError: the disk is full or refuses.
     """
     refuse_existing(path, force)
-    reference, markers = (path.with_name(path.stem + end) for end in (".reference.tum", ".markers.json"))
+    reference, markers = reference_path(path), path.with_name(f"{path.stem}.markers.json")
     with ExitStack() as outputs:
         write_trajectory(outputs.enter_context(atomic_path(reference)), drive.trajectory)
         if drive.world.markers:

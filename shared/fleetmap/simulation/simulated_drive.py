@@ -143,6 +143,12 @@ class SimulatedDrive:
         return stamp_ns, (stamp_ns - self.motion.start_ns) * 1e-9
 
 
+def require_readout(readout_s: float) -> None:
+    """Raise InputError for a rolling shutter that no camera has."""
+    if not 0.0 <= readout_s <= LONGEST_READOUT_S:
+        raise InputError(f"a shutter of {readout_s:g} s makes no sense; give 0 to {LONGEST_READOUT_S:g} s")
+
+
 def simulate_drive(
     world: World | Street,
     *,
@@ -183,8 +189,7 @@ def simulate_drive(
     Raises:
         InputError: an unknown error model, or an interval, gap, offset or readout that makes no sense.
     """
-    if not 0.0 <= readout_s <= LONGEST_READOUT_S:
-        raise InputError(f"a shutter of {readout_s:g} s makes no sense; give 0 to {LONGEST_READOUT_S:g} s")
+    require_readout(readout_s)
     if isinstance(world, Street):
         world = World(world.anchor, world.path, world.length_m, False, Scene(world.surfaces, world.atlas))
     motion = motion_of(world.anchor, trajectory) if motion is None else motion
