@@ -1,11 +1,14 @@
 """The map while it is being made: keyframes and landmarks in the free-scale frame ``vis``.
 
 Who saw what is kept once, in each keyframe's ``landmark_of``. Landmarks live in parallel arrays that grow by
-doubling; a dead landmark keeps its row and is skipped.
+doubling; a dead landmark keeps its row and is skipped. Each knows the range of keyframes that may hold it, so
+that no step has to look at the whole drive.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +17,13 @@ from numpy.typing import NDArray
 from fleetmap.camera import Camera
 from fleetmap.geometry import Pose
 from fleetmap.vision.features import Features
+from fleetmap_mapper.bookkeeping import (
+    add_views,
+    count_marked,
+    distinct_living,
+    follow_fusions,
+    marked_features,
+)
 
 Array = NDArray[np.float64]
 Ids = NDArray[np.int32]
@@ -30,6 +40,10 @@ _LANDMARK_ARRAYS = (
     "found",
     "alive",
     "merged_into",
+    "observations",
+    "oldest",
+    "newest",
+    "_marks",
 )
 
 
@@ -66,15 +80,21 @@ class GrowingMap:
         self.found: NDArray[np.int64] = np.zeros(1024, np.int64)  # frames that did
         self.alive: NDArray[np.bool_] = np.zeros(1024, np.bool_)
         self.merged_into: NDArray[np.int64] = np.zeros(1024, np.int64)  # itself unless fused with another
+        self.observations: NDArray[np.int64] = np.zeros(1024, np.int64)  # keyframes that see it
+        self.oldest: NDArray[np.int64] = np.zeros(1024, np.int64)  # no keyframe before this one has seen it
+        self.newest: NDArray[np.int64] = np.zeros(1024, np.int64)  # and none after this one
+        self._marks: Ids = np.zeros(1024, np.int32)  # all zero between calls
+        self._touched: list[Ids] = []
 
     def add_keyframe(
         self, frame_index: int, stamp_ns: int, vis_from_cam: Pose, features: Features, landmark_of: Ids
     ) -> Keyframe:
-        """Append a keyframe."""
-        keyframe = Keyframe(
-            len(self.keyframes), frame_index, stamp_ns, vis_from_cam, features, landmark_of.astype(np.int32)
-        )
+        """Append a keyframe that sees some landmarks already."""
+        nothing = np.full(len(features), -1, np.int32)
+        keyframe = Keyframe(len(self.keyframes), frame_index, stamp_ns, vis_from_cam, features, nothing)
         self.keyframes.append(keyframe)
+        rows = np.flatnonzero(landmark_of >= 0)
+        self.observe(keyframe, rows, landmark_of[rows].astype(np.int32))
         return keyframe
 
     def add_landmarks(
@@ -87,61 +107,95 @@ class GrowingMap:
         self.points[ids] = points
         self.alive[ids] = True
         self.merged_into[ids] = ids
-        self.reference[ids] = second.index
+        self.reference[ids] = self.oldest[ids] = self.newest[ids] = second.index
         self.visible[ids] = self.found[ids] = 1
-        first.landmark_of[first_feature] = ids
-        second.landmark_of[second_feature] = ids
+        self.observe(first, first_feature, ids)
+        self.observe(second, second_feature, ids)
+        self.touch(ids)
         self.refresh(ids, [first, second])
+        return ids
+
+    def observe(self, keyframe: Keyframe, features: NDArray[np.integer], landmarks: Ids) -> None:
+        """Enter that features (n,) of a keyframe, which hold nothing yet, show landmarks (n,), each once."""
+        keyframe.landmark_of[features] = landmarks
+        self.observations[landmarks] += 1
+        self.oldest[landmarks] = np.minimum(self.oldest[landmarks], keyframe.index)
+        self.newest[landmarks] = np.maximum(self.newest[landmarks], keyframe.index)
+
+    def forget(self, keyframe: Keyframe, features: NDArray[np.integer]) -> None:
+        """Take observations (n,) out of a keyframe."""
+        landmarks = keyframe.landmark_of[features]
+        keyframe.landmark_of[features] = -1
+        self.observations[landmarks] -= 1
+        self.touch(landmarks)
+
+    def count_sighting(self, expected: Ids, found: Ids) -> None:
+        """A frame should have seen some landmarks, and found some."""
+        self.visible[expected] += 1
+        self.found[found] += 1
+        self.touch(expected)
+
+    def touch(self, ids: Ids) -> None:
+        """Put landmarks on the list of those that may have become doubtful."""
+        self._touched.append(ids)
+
+    def take_touched(self) -> Ids:
+        """The living landmarks on that list, each once; it is empty afterwards."""
+        touched = np.concatenate(self._touched) if self._touched else np.zeros(0, np.int32)
+        self._touched = []
+        ids: Ids = distinct_living(touched, self.alive)
         return ids
 
     def refresh(self, ids: Ids, observers: list[Keyframe]) -> None:
         """Renew what is derived from the observations of some landmarks: normal, descriptor, octave, distance."""
-        wanted = np.zeros(self.landmark_count, np.bool_)
-        wanted[ids] = True
-        sums = np.zeros((self.landmark_count, 3))
-        for keyframe in sorted(observers, key=lambda k: k.index):
-            features = np.flatnonzero(keyframe.landmark_of >= 0)
-            seen = keyframe.landmark_of[features]
-            features, seen = features[wanted[seen]], seen[wanted[seen]]
-            rays = keyframe.vis_from_cam.translation_m - self.points[seen]
-            lengths = np.linalg.norm(rays, axis=1)
-            sums[seen] += rays / lengths[:, None]
-            self.descriptors[seen] = keyframe.features.descriptors[features]
-            self.octaves[seen] = keyframe.features.octaves[features]
-            self.distances[seen] = lengths
-        seen_at_all = wanted & (np.abs(sums).sum(axis=1) > 0)
-        self.normals[: self.landmark_count][seen_at_all] = (
-            sums[seen_at_all] / np.linalg.norm(sums[seen_at_all], axis=1)[:, None]
-        )
+        sums = np.zeros((len(ids), 3))
+        with self._marked(ids):
+            for keyframe in sorted(observers, key=lambda k: k.index):
+                add_views(
+                    keyframe.landmark_of,
+                    keyframe.features.descriptors,
+                    keyframe.features.octaves,
+                    keyframe.vis_from_cam.translation_m,
+                    self._marks,
+                    self.points,
+                    sums,
+                    self.descriptors,
+                    self.octaves,
+                    self.distances,
+                )
+        seen = np.abs(sums).sum(axis=1) > 0
+        self.normals[ids[seen]] = sums[seen] / np.linalg.norm(sums[seen], axis=1)[:, None]
 
     def kill(self, ids: Ids) -> None:
         """Forget landmarks."""
         self.alive[ids] = False
-        for keyframe in self.keyframes:
-            dead = (keyframe.landmark_of >= 0) & ~self.alive[np.maximum(keyframe.landmark_of, 0)]
-            keyframe.landmark_of[dead] = -1
+        self.observations[ids] = 0
+        with self._marked(ids):
+            for keyframe in self._holders(ids):
+                keyframe.landmark_of[marked_features(keyframe.landmark_of, self._marks)] = -1
 
     def merge(self, lost: Ids, kept: Ids) -> None:
         """Fuse pairs of landmarks: every observation of ``lost[n]`` becomes one of ``kept[n]``."""
-        target = np.arange(self.landmark_count, dtype=np.int32)
+        target: dict[int, int] = {}
         for a, b in zip(lost.tolist(), kept.tolist(), strict=True):
             a, b = _end(target, a), _end(target, b)
             if a != b:
                 target[a] = b
-                self.found[b] += self.found[a]
-                self.visible[b] += self.visible[a]
-        gone = np.flatnonzero(target != np.arange(self.landmark_count))
-        target[gone] = [_end(target, int(i)) for i in gone]
-        self.merged_into[gone] = target[gone]
+                for tally in (self.found, self.visible, self.observations):
+                    tally[b] += tally[a]
+                self.oldest[b] = min(self.oldest[a], self.oldest[b])
+                self.newest[b] = max(self.newest[a], self.newest[b])
+        gone = np.array(sorted(target), np.int32)
+        successors = np.array([_end(target, a) for a in gone.tolist()], np.int32)
+        self.merged_into[gone] = successors
         self.alive[gone] = False
-        is_target = np.zeros(self.landmark_count + 1, np.bool_)  # the last entry stands for "no landmark"
-        is_target[target[gone]] = True
-        following = np.append(target, np.int32(-1))
-        for keyframe in self.keyframes:
-            renamed = following[keyframe.landmark_of]
-            if np.any(renamed != keyframe.landmark_of):
-                keyframe.landmark_of = renamed
-                _drop_repeats(keyframe.landmark_of, np.flatnonzero(is_target[renamed]))
+        self.observations[gone] = 0
+        self.touch(successors)
+        with self._marked(gone):
+            self._marks[successors] = -np.arange(1, len(successors) + 1)
+            for keyframe in self._holders(gone):
+                follow_fusions(keyframe.landmark_of, self._marks, successors, self.observations)
+            self._marks[successors] = 0
 
     def resolve(self, ids: Ids) -> Ids:
         """What became of landmarks that were fused since; -1 for those that died."""
@@ -152,27 +206,23 @@ class GrowingMap:
                 return np.where(self.alive[current], current, -1).astype(np.int32)
             current = following
 
-    def covisible(self, landmark_ids: Ids, among: list[Keyframe] | None = None) -> list[tuple[Keyframe, int]]:
+    def covisible(self, landmark_ids: Ids) -> list[tuple[Keyframe, int]]:
         """Keyframes that see any of the landmarks, with how many, most first (newest first at a tie)."""
-        mark = np.zeros(self.landmark_count + 1, np.bool_)  # the last entry stands for "no landmark"
-        mark[landmark_ids] = True
-        keyframes = self.keyframes if among is None else among
-        counts = [(k, int(np.count_nonzero(mark[k.landmark_of]))) for k in keyframes]
+        with self._marked(landmark_ids):
+            counts = [(k, count_marked(k.landmark_of, self._marks)) for k in self._holders(landmark_ids)]
         return sorted((c for c in counts if c[1] > 0), key=lambda c: (-c[1], -c[0].index))
 
     def landmarks_of(self, keyframes: list[Keyframe]) -> Ids:
         """Ids of all living landmarks that the keyframes see."""
-        mark = np.zeros(self.landmark_count, np.bool_)
-        for keyframe in keyframes:
-            mark[keyframe.landmarks()] = True
-        return np.flatnonzero(mark & self.alive[: self.landmark_count]).astype(np.int32)
+        seen = np.concatenate([k.landmark_of for k in keyframes]) if keyframes else np.zeros(0, np.int32)
+        ids: Ids = distinct_living(seen, self.alive)
+        return ids
 
-    def observation_counts(self) -> NDArray[np.int64]:
-        """Number of keyframes that see each landmark."""
-        counts = np.zeros(self.landmark_count, np.int64)
-        for keyframe in self.keyframes:
-            counts[keyframe.landmarks()] += 1
-        return counts
+    def observations_of(self, landmarks: Ids, keyframes: list[Keyframe]) -> list[tuple[NDArray[np.int64], Ids]]:
+        """For every keyframe the features (n,) that show any of the landmarks, and which of the list each shows."""
+        with self._marked(landmarks):
+            rows = [marked_features(k.landmark_of, self._marks) for k in keyframes]
+            return [(r, self._marks[k.landmark_of[r]] - 1) for r, k in zip(rows, keyframes, strict=True)]
 
     def reserve(self, count: int) -> None:
         """Make room for so many landmarks."""
@@ -184,16 +234,23 @@ class GrowingMap:
             array = getattr(self, name)
             setattr(self, name, np.concatenate([array, np.zeros((more, *array.shape[1:]), array.dtype)]))
 
+    @contextmanager
+    def _marked(self, ids: Ids) -> Iterator[None]:
+        """For compiled loops: ``_marks`` tells the place of each landmark in ``ids``, plus one."""
+        self._marks[ids] = np.arange(1, len(ids) + 1)
+        try:
+            yield
+        finally:
+            self._marks[ids] = 0
 
-def _end(target: Ids, index: int) -> int:
-    while target[index] != index:
-        index = int(target[index])
+    def _holders(self, ids: Ids) -> list[Keyframe]:
+        """The keyframes among which are all that hold any of the landmarks."""
+        if len(ids) == 0:
+            return []
+        return self.keyframes[self.oldest[ids].min() : self.newest[ids].max() + 1]
+
+
+def _end(target: dict[int, int], index: int) -> int:
+    while index in target:
+        index = target[index]
     return index
-
-
-def _drop_repeats(landmark_of: Ids, rows: NDArray[np.intp]) -> None:
-    """After a fusion an image may hold one landmark twice, in some of these rows: keep the first feature."""
-    _, first = np.unique(landmark_of[rows], return_index=True)
-    repeated = np.ones(len(rows), np.bool_)
-    repeated[first] = False
-    landmark_of[rows[repeated]] = -1

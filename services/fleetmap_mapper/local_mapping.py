@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from fleetmap.geometry import Pose
 from fleetmap.vision.epipolar_matching import match_epipolar
 from fleetmap_mapper.adjustment import AdjustmentProblem, adjust
+from fleetmap_mapper.bookkeeping import sorted_by_landmark
 from fleetmap_mapper.growing_map import SCALE_FACTOR, GrowingMap, Ids, Keyframe
 from fleetmap_mapper.settings import MapperSettings
 from fleetmap_mapper.tracking import match_landmarks
@@ -87,7 +88,7 @@ def _fuse_into(
     landmarks, features = landmarks[fits], features[fits]
     held = keyframe.landmark_of[features]
     empty = held < 0
-    keyframe.landmark_of[features[empty]] = landmarks[empty]
+    growing.observe(keyframe, features[empty], landmarks[empty])
     if np.any(~empty):
         pair = np.stack([landmarks[~empty], held[~empty]])
         first_is_better = growing.found[pair[0]] > growing.found[pair[1]]
@@ -125,35 +126,26 @@ def _problem(
     growing: GrowingMap, keyframes: list[Keyframe], is_fixed: NDArray[np.bool_], landmarks: Ids
 ) -> tuple[AdjustmentProblem, NDArray[np.intp], Ids]:
     """The adjustment's arrays, the feature behind each observation, and the landmark behind each point."""
-    wanted = np.zeros(growing.landmark_count, np.bool_)
-    wanted[landmarks] = True
-    slots, features, ids, pixels, sigmas = [], [], [], [], []
-    for slot, keyframe in enumerate(keyframes):
-        rows = np.flatnonzero(keyframe.landmark_of >= 0)
-        rows = rows[wanted[keyframe.landmark_of[rows]]]
-        slots.append(np.full(len(rows), slot, np.int32))
-        features.append(rows)
-        ids.append(keyframe.landmark_of[rows])
-        pixels.append(keyframe.features.pixels[rows])
-        sigmas.append(keyframe.features.sigmas_px[rows])
-    seen = np.concatenate(ids)
-    counts = np.bincount(seen, minlength=growing.landmark_count)
-    order = np.argsort(seen, kind="stable")
-    order = order[counts[seen[order]] >= 2]
-    unique, point_index = np.unique(seen[order], return_inverse=True)
+    seen = growing.observations_of(landmarks, keyframes)
+    rows, places = (np.concatenate(parts) for parts in zip(*seen, strict=True))
+    order, point_index, kept = sorted_by_landmark(places, len(landmarks))
+    slots = np.repeat(np.arange(len(keyframes), dtype=np.int32), [len(r) for r, _ in seen])
+    pixels = np.concatenate([k.features.pixels[r] for k, (r, _) in zip(keyframes, seen, strict=True)])
+    sigmas = np.concatenate([k.features.sigmas_px[r] for k, (r, _) in zip(keyframes, seen, strict=True)])
+    ids = landmarks[kept]
     inverse = [k.vis_from_cam.inverse() for k in keyframes]
     problem = AdjustmentProblem(
         growing.camera,
         np.array([p.rotation for p in inverse]),
         np.array([p.translation_m for p in inverse]),
         is_fixed,
-        growing.points[unique],
-        np.concatenate(slots)[order],
-        point_index.astype(np.int32),
-        np.concatenate(pixels)[order],
-        np.concatenate(sigmas)[order],
+        growing.points[ids],
+        slots[order],
+        point_index,
+        pixels[order],
+        sigmas[order],
     )
-    return problem, np.concatenate(features)[order], unique.astype(np.int32)
+    return problem, rows[order], ids
 
 
 def _drop_outliers(
@@ -167,7 +159,7 @@ def _drop_outliers(
     """Take observations beyond 95 % out, and landmarks that are left with fewer than two."""
     bad = chi2 > CHI2_2DOF_95
     for slot in np.unique(problem.keyframe_index[bad]):
-        keyframes[slot].landmark_of[features[bad & (problem.keyframe_index == slot)]] = -1
+        growing.forget(keyframes[slot], features[bad & (problem.keyframe_index == slot)])
     kept = np.bincount(problem.point_index[~bad], minlength=len(problem.points))
     touched = np.unique(problem.point_index[bad])
     growing.kill(ids[touched[kept[touched] < 2]])
@@ -175,13 +167,13 @@ def _drop_outliers(
 
 def sweep_young_landmarks(growing: GrowingMap, min_observations: int) -> None:
     """Drop landmarks that are rarely found where they should be, or never became more than a pair."""
-    newest = len(growing.keyframes) - 1
-    counts = growing.observation_counts()
-    n = growing.landmark_count
-    age = newest - growing.reference[:n]
-    rarely = growing.found[:n] < _MIN_FOUND_RATIO * growing.visible[:n]
-    lonely = (age >= _RECENT_KEYFRAMES - 1) & (counts < min_observations)
-    growing.kill(np.flatnonzero(growing.alive[:n] & (rarely | lonely)).astype(np.int32))
+    ids = growing.take_touched()
+    age = len(growing.keyframes) - 1 - growing.reference[ids]
+    is_young = age < _RECENT_KEYFRAMES - 1
+    rarely = growing.found[ids] < _MIN_FOUND_RATIO * growing.visible[ids]
+    lonely = ~is_young & (growing.observations[ids] < min_observations)
+    growing.kill(ids[rarely | lonely])
+    growing.touch(ids[is_young & ~rarely])
 
 
 def median_depth(growing: GrowingMap, keyframe: Keyframe) -> float:

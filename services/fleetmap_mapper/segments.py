@@ -41,9 +41,10 @@ def _append_landmarks(joined: GrowingMap, growing: GrowingMap, S: Sim3, keyframe
     joined.points[rows] = S.transform(growing.points[:count])
     joined.normals[rows] = growing.normals[:count] @ S.rotation.T
     joined.distances[rows] = growing.distances[:count] * S.scale
-    joined.reference[rows] = growing.reference[:count] + keyframe_offset
+    for name in ("reference", "oldest", "newest"):
+        getattr(joined, name)[rows] = getattr(growing, name)[:count] + keyframe_offset
     joined.merged_into[rows] = growing.merged_into[:count] + first
-    for name in ("descriptors", "octaves", "visible", "found", "alive"):
+    for name in ("descriptors", "octaves", "visible", "found", "alive", "observations"):
         getattr(joined, name)[rows] = getattr(growing, name)[:count]
 
 

@@ -48,8 +48,7 @@ def track(
     fine = _project_and_refine(growing, features, coarse.vis_from_cam, local, settings.refined_radius_px, settings)
     if fine is None or len(fine.landmarks) < settings.min_inliers:
         return None
-    growing.found[fine.landmarks] += 1
-    growing.visible[local[_visible(growing, local, fine.vis_from_cam)[0]]] += 1
+    growing.count_sighting(local[_visible(growing, local, fine.vis_from_cam)[0]], fine.landmarks)
     return fine
 
 

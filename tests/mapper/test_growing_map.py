@@ -94,7 +94,16 @@ def test_what_is_forgotten_is_nowhere(growing):
     growing.kill(np.array([0, 1, 9], np.int32))
     assert growing.resolve(np.array([0, 1, 2, 9], np.int32)).tolist() == [-1, -1, 2, -1]
     assert growing.landmarks_of(growing.keyframes).tolist() == sorted(set(range(18)) - {0, 1, 9})
-    assert growing.observation_counts()[[0, 1, 9]].tolist() == [0, 0, 0]
+    assert growing.observations[[0, 1, 9]].tolist() == [0, 0, 0]
+
+
+def test_an_observation_taken_out_is_counted_out(growing):
+    growing.take_touched()
+    growing.forget(growing.keyframes[1], np.flatnonzero(growing.keyframes[1].landmark_of == 8))
+    assert observers(growing, 8) == {2}
+    assert growing.observations[[7, 8]].tolist() == [2, 1]
+    assert growing.take_touched().tolist() == [8]
+    assert growing.take_touched().tolist() == []
 
 
 def test_covisible_keyframes_come_most_shared_first(growing):
@@ -187,10 +196,16 @@ class MapStories(RuleBasedStateMachine):
 
     @invariant()
     def counts_agree(self) -> None:
-        counts = self.growing.observation_counts()
+        counts = self.growing.observations[: self.growing.landmark_count]
         assert counts.tolist() == [len(self.seen.get(i, ())) for i in range(len(counts))]
         shared = self.growing.covisible(np.array(sorted(self.seen), np.int32))
         assert {k.index: n for k, n in shared} == dict(Counter(k for ks in self.seen.values() for k in ks))
+
+    @invariant()
+    def every_observer_is_in_the_range_its_landmark_knows(self) -> None:
+        for landmark, keyframes in self.seen.items():
+            assert self.growing.oldest[landmark] <= min(keyframes, default=0)
+            assert self.growing.newest[landmark] >= max(keyframes, default=0)
 
     def _end(self, landmark: int) -> int:
         while landmark in self.became:

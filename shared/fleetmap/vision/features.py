@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -47,7 +48,7 @@ class Features:
     def __len__(self) -> int:
         return len(self.pixels)
 
-    @property
+    @cached_property
     def sigmas_px(self) -> Array:
         """Localisation sigma of each feature (N,): one pixel of the pyramid level it was found on."""
         return np.asarray(self.scale_factor ** self.octaves.astype(np.float64))

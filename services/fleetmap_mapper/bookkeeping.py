@@ -1,0 +1,110 @@
+"""Compiled loops over who saw what; each costs as much as the keyframes and landmarks it is given, however long
+the drive has been.
+
+``marks`` has one entry for every landmark: 0, or one more than its place in a list of landmarks at hand.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+
+@njit(cache=True, nogil=True)
+def count_marked(landmark_of, marks):  # type: ignore[no-untyped-def]
+    """Number of features whose landmark is marked."""
+    count = 0
+    for landmark in landmark_of:
+        if landmark >= 0 and marks[landmark] > 0:
+            count += 1
+    return count
+
+
+@njit(cache=True, nogil=True)
+def marked_features(landmark_of, marks):  # type: ignore[no-untyped-def]
+    """Features (n,) int64 whose landmark is marked."""
+    features = np.empty(len(landmark_of), np.int64)
+    count = 0
+    for feature, landmark in enumerate(landmark_of):
+        if landmark >= 0 and marks[landmark] > 0:
+            features[count] = feature
+            count += 1
+    return features[:count].copy()
+
+
+@njit(cache=True, nogil=True)
+def distinct_living(landmark_of, alive):  # type: ignore[no-untyped-def]
+    """Sorted ids (n,) int32 of the living landmarks among these, each once; -1 is skipped."""
+    lowest, highest = len(alive), -1
+    for landmark in landmark_of:
+        if landmark >= 0:
+            lowest, highest = min(lowest, landmark), max(highest, landmark)
+    is_seen = np.zeros(max(highest - lowest + 1, 0), np.bool_)
+    for landmark in landmark_of:
+        if landmark >= 0 and alive[landmark]:
+            is_seen[landmark - lowest] = True
+    return (np.flatnonzero(is_seen) + lowest).astype(np.int32)
+
+
+@njit(cache=True, nogil=True)
+def add_views(  # type: ignore[no-untyped-def]
+    landmark_of, feature_descriptors, feature_octaves, centre, marks, points, sums, descriptors, octaves, distances
+):
+    """Add one keyframe's unit rays to the sums (n, 3) of the marked landmarks; it is the latest to see them."""
+    for feature, landmark in enumerate(landmark_of):
+        if landmark < 0 or marks[landmark] == 0:
+            continue
+        x, y, z = centre[0] - points[landmark, 0], centre[1] - points[landmark, 1], centre[2] - points[landmark, 2]
+        length = np.sqrt(x * x + y * y + z * z)
+        row = marks[landmark] - 1
+        sums[row, 0] += x / length
+        sums[row, 1] += y / length
+        sums[row, 2] += z / length
+        for byte in range(feature_descriptors.shape[1]):
+            descriptors[landmark, byte] = feature_descriptors[feature, byte]
+        octaves[landmark] = feature_octaves[feature]
+        distances[landmark] = length
+
+
+@njit(cache=True, nogil=True)
+def follow_fusions(landmark_of, marks, successors, observations):  # type: ignore[no-untyped-def]
+    """Rename the marked landmarks in one keyframe; where it then holds one twice, the first feature keeps it."""
+    is_renamed = False
+    for feature, landmark in enumerate(landmark_of):
+        if landmark >= 0 and marks[landmark] > 0:
+            landmark_of[feature] = successors[marks[landmark] - 1]
+            is_renamed = True
+    if not is_renamed:
+        return
+    is_held = np.zeros(len(successors), np.bool_)
+    for feature, landmark in enumerate(landmark_of):
+        if landmark < 0 or marks[landmark] >= 0:
+            continue
+        place = -marks[landmark] - 1  # survivors of fusions are marked with negative places
+        if is_held[place]:
+            landmark_of[feature] = -1
+            observations[landmark] -= 1
+        is_held[place] = True
+
+
+@njit(cache=True, nogil=True)
+def sorted_by_landmark(places, count):  # type: ignore[no-untyped-def]
+    """Observations of landmarks 0 .. count - 1, sorted by landmark, without those of landmarks seen once.
+
+    Returns their order (m,), the landmark of each renumbered (m,) int32, and the landmarks that are left (n,).
+    """
+    seen = np.zeros(count, np.int64)
+    for place in places:
+        seen[place] += 1
+    kept = np.flatnonzero(seen >= 2)
+    row, next_slot = np.full(count, -1, np.int32), np.zeros(count, np.int64)
+    total = 0
+    for n, place in enumerate(kept):
+        row[place], next_slot[place] = n, total
+        total += seen[place]
+    order, rows = np.empty(total, np.int64), np.empty(total, np.int32)
+    for observation, place in enumerate(places):
+        if row[place] >= 0:
+            order[next_slot[place]], rows[next_slot[place]] = observation, row[place]
+            next_slot[place] += 1
+    return order, rows, kept
