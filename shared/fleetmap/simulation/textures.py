@@ -155,12 +155,7 @@ def _paint_wall(rng: Rng, width_m: float, height_m: float) -> Canvas:
     base = float(rng.choice([rng.uniform(80.0, 130.0), rng.uniform(150.0, 215.0)]))
     wall = Canvas(rng, width_m, height_m, WALL_PX_PER_M, base)
     if rng.random() < 0.35:
-        course, brick = 0.1, 0.3
-        for row in range(int(height_m / course)):
-            y, shift = row * course, (row % 2) * brick / 2.0
-            for x in np.arange(-shift, width_m, brick):
-                wall.darken(x, y, x + brick - 0.025, y + course - 0.025, float(rng.normal(1.0, 0.09)))
-            wall.darken(0.0, y + course - 0.025, width_m, y + course, 0.8)
+        _lay_bricks(wall)
     wall.grain(7.0, 3.0, 0.8)
     for _ in range(int(width_m)):
         x, w = rng.uniform(0.0, width_m), rng.uniform(0.1, 0.5)
@@ -169,6 +164,20 @@ def _paint_wall(rng: Rng, width_m: float, height_m: float) -> Canvas:
     wall.darken(0.0, height_m - rng.uniform(0.4, 1.0), width_m, height_m, float(rng.uniform(0.6, 0.85)))
     wall.darken(0.0, 0.0, width_m, 0.3, 0.6)
     return wall
+
+
+def _lay_bricks(wall: Canvas) -> None:
+    course, brick, joint = 0.1, 0.3, 0.025
+    for row in range(int(wall.height_m / course)):
+        y, shift = row * course, (row % 2) * brick / 2.0
+        lefts = np.arange(-shift, wall.width_m, brick)
+        tones = wall.rng.normal(1.0, 0.09, len(lefts)).astype(np.float32)
+        columns = np.ones(wall.grey.shape[1], dtype=np.float32)
+        starts, stops = (np.rint(x * wall.scale[0]).astype(int) for x in (lefts, lefts + brick - joint))
+        for start, stop, tone in zip(starts.tolist(), stops.tolist(), tones, strict=True):
+            columns[max(start, 0) : stop] = tone
+        wall.patch(0.0, y, wall.width_m, y + course - joint)[...] *= columns
+        wall.darken(0.0, y + course - joint, wall.width_m, y + course, 0.8)
 
 
 def _paint_window(wall: Canvas, x: float, y: float, w: float, h: float, shutters: bool) -> None:
