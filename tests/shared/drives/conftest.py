@@ -114,7 +114,8 @@ class ForeignRecorder:
     def odometry(self, topic: str, stamp_ns: int, forward_mps: float) -> None:
         geometry = "geometry_msgs/msg/"
         pose = TYPES.types[geometry + "Pose"](
-            TYPES.types[geometry + "Point"](7.0, 8.0, 9.0), TYPES.types[geometry + "Quaternion"](0.0, 0.0, 0.0, 1.0)
+            TYPES.types[geometry + "Point"](7.0, 8.0, 9.0),
+            TYPES.types[geometry + "Quaternion"](0.0, 0.0, 0.0, 1.0),
         )
         message = TYPES.types["nav_msgs/msg/Odometry"](
             header(stamp_ns, "odom"),

@@ -201,7 +201,7 @@ class TestCalibration:
             camera_of(K=(), P=(), D=())
 
     def test_half_a_matrix_is_refused(self, camera_of):
-        with pytest.raises(DriveError, match="no foxglove.CameraCalibration as fleetmap knows it"):
+        with pytest.raises(DriveError, match=r"no foxglove\.CameraCalibration as fleetmap knows it"):
             camera_of(K=(1.0, 2.0, 3.0, 4.0))
 
     def test_an_image_of_another_size_is_refused_with_the_numbers(self, record, small_camera, pictures):
@@ -255,7 +255,8 @@ class TestTransforms:
         assert found.position_in_cam_m == pytest.approx([0.5, 2.0, 2.0])  # (-2, 0.5, 2) turned back by 90 degrees
 
     def test_a_bundle_of_transforms_is_unpacked(self, drive_with):
-        bundle = FrameTransforms(transforms=[transform("cam", "mast", (1, 0, 0)), transform("mast", "gnss", (1, 0, 0))])
+        links = [transform("cam", "mast", (1.0, 0.0, 0.0)), transform("mast", "gnss", (1.0, 0.0, 0.0))]
+        bundle = FrameTransforms(transforms=links)
         found = self.antenna(drive_with, bundle)
         assert found.position_in_cam_m == pytest.approx([1.0, 1.0, 0.0])
 

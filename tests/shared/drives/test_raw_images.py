@@ -146,9 +146,6 @@ def test_a_huge_size_is_refused_without_reserving_memory():
 
 @pytest.mark.parametrize("pattern", BAYER)
 @pytest.mark.parametrize(("width", "height"), [(1, 1), (2, 1), (3, 3)])
-def test_tiny_bayer_images_are_decoded_or_refused(pattern, width, height):
+def test_tiny_bayer_images_are_decoded(pattern, width, height):
     tiny = RawPicture(f"bayer_{pattern}8", width, height, width, np.full(width * height, 50, np.uint8))
-    try:
-        assert decode_raw(tiny).shape == (height, width)
-    except ValueError as error:
-        assert str(error)
+    assert decode_raw(tiny).shape == (height, width)

@@ -21,7 +21,10 @@ FRAME_NS = 100_000_000
 WIDTH, HEIGHT, COUNT, KEYFRAME_EVERY = 320, 160, 20, 10
 ENCODERS = {
     "h264": ("libx264", {"preset": "ultrafast", "tune": "zerolatency"}),
-    "h265": ("libx265", {"preset": "ultrafast", "tune": "zerolatency", "x265-params": "log-level=none:open-gop=0"}),
+    "h265": (
+        "libx265",
+        {"preset": "ultrafast", "tune": "zerolatency", "x265-params": "log-level=none:open-gop=0"},
+    ),
     "vp9": ("libvpx-vp9", {"deadline": "realtime", "cpu-used": "8", "lag-in-frames": "0"}),
     "av1": ("libsvtav1", {"preset": "11", "svtav1-params": "pred-struct=1"}),
 }
@@ -110,7 +113,9 @@ def test_pictures_that_the_decoder_holds_back_come_at_the_end(record_video):
 def test_colour_becomes_grey_of_full_range(record_video):
     pictures = [np.full((HEIGHT, WIDTH), value, np.uint8) for value in (0, 128, 255)]
     for pixel_format in ("yuv420p", "yuvj420p"):
-        frames = list(open_drive(record_video(packets_of("h264", pictures, pixel_format=pixel_format), "h264")).frames())
+        frames = list(
+            open_drive(record_video(packets_of("h264", pictures, pixel_format=pixel_format), "h264")).frames()
+        )
         for frame, picture in zip(frames, pictures, strict=True):
             assert np.abs(frame.image.astype(int) - picture).max() <= 3
 
@@ -126,7 +131,9 @@ class TestBadVideo:
         path = record_video(packets_of("h264", pictures_of(10))[1:], "h264")
         assert f"the video on /video in {path} has no keyframe" in self.refusal_of(path)
 
-    @pytest.mark.parametrize(("data", "reason"), [(b"no packet at all", "the decoder refuses"), (b"", "it is empty")])
+    @pytest.mark.parametrize(
+        ("data", "reason"), [(b"no packet at all", "the decoder refuses"), (b"", "it is empty")]
+    )
     def test_a_packet_that_is_none_is_refused_and_named(self, record_video, data, reason):
         packets = packets_of("h264", pictures_of(10))
         packets[4] = (4, data)
