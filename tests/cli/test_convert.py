@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import cv2
@@ -287,6 +288,12 @@ def test_the_same_conversion_gives_the_same_bytes_and_needs_force(
     assert output.read_bytes() == first
 
 
+def open_after(pipe: Path, process: subprocess.Popen[str]) -> None:
+    """Frees whoever waits for a process to read a pipe, should the process end without."""
+    process.wait()
+    os.close(os.open(pipe, os.O_RDONLY | os.O_NONBLOCK))
+
+
 def test_an_interrupted_conversion_leaves_nothing(phone, camera_file, tmp_path):
     """The last image is a pipe: once the conversion waits in it, all before is written."""
     folder, table = phone
@@ -296,6 +303,7 @@ def test_an_interrupted_conversion_leaves_nothing(phone, camera_file, tmp_path):
     arguments = ["convert", "folder", str(folder), str(table), str(output), "--camera", str(camera_file)]
     command = [sys.executable, "-c", "from fleetmap_cli.main import main; main()", *arguments]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    threading.Thread(target=open_after, args=(pipe, process), daemon=True).start()
     with pipe.open("wb"):  # returns when the other side reads
         assert [path.suffix for path in output.parent.iterdir()] == [".part"]
         process.send_signal(signal.SIGINT)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 from fleetmap.camera import Camera
@@ -128,7 +129,19 @@ def _stamped(images: list[Path], positions: Table, clock: ImageClock) -> list[St
         StampedImage(checked_stamp_ns(stamp_ns + offset_ns, str(path)), path)
         for path, stamp_ns in zip(images, stamps_ns, strict=True)
     ]
-    return sorted(stamped, key=lambda image: image.stamp_ns)
+    stamped.sort(key=lambda image: image.stamp_ns)
+    _refuse_equal_times(stamped)
+    return stamped
+
+
+def _refuse_equal_times(images: list[StampedImage]) -> None:
+    """Frames of one video often bear the video's time, and bursts of photos whole seconds."""
+    for first, second in pairwise(images):
+        if first.stamp_ns == second.stamp_ns:
+            raise DriveError(
+                f"{first.path} and {second.path.name} have the same time, {clock_text(first.stamp_ns)};"
+                " give --image-times CSV, or --rate-hz and --start"
+            )
 
 
 def _stamps_of_table(images: list[Path], table: Table) -> list[int]:

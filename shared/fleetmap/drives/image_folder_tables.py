@@ -31,7 +31,7 @@ from fleetmap.geodesy import UtmGrid
 UNKNOWN_HEIGHT_SIGMA_M = 10.0  # of a height that no column holds: roads climb
 
 _NAMES = {
-    "time": "time timestamp stamp datetime utc utctime timeutc gpstime unixtime unix epoch t",
+    "time": "time timestamp stamp datetime utc utctime timeutc gpstime gpstimestamp unixtime unix epoch t",
     "date": "date day gpsdate",
     "lat": "lat latitude gpslatitude",
     "lon": "lon lng long longitude gpslongitude",

@@ -122,10 +122,10 @@ def _read_images(folder: Path, name: str) -> list[StampedImage]:
         raise DriveError(f"{folder} is no TUM RGB-D folder: it holds no {name}")
     images = []
     for number, fields in _rows(table):
-        path = folder.joinpath(*fields[1:])
-        if len(fields) != 2 or not path.resolve().is_relative_to(folder.resolve()):
+        path = Path(*fields[1:])
+        if len(fields) != 2 or path.is_absolute() or ".." in path.parts:
             raise DriveError(f"{table} line {number} is not 'timestamp filename' of a file in {folder}")
-        images.append(StampedImage(_stamp_ns(table, number, fields), path))
+        images.append(StampedImage(_stamp_ns(table, number, fields), folder / path))
     if not images:
         raise DriveError(f"{table} names no images")
     return images

@@ -82,6 +82,23 @@ def test_every_way_to_name_a_sequence_gives_the_same(dataset, tmp_path, way):
     assert done.reference is not None
 
 
+def test_another_tool_reads_back_what_the_folder_holds(dataset, tmp_path, read_by_rosbags):
+    gnss = SimulatedGnss("consumer", interval_s=0.5, antenna_in_camera_m=(-0.5, -1.6, 0.3))
+    done = convert_kitti_odometry(dataset, tmp_path / "out.mcap", sequence="07", gnss=gnss, origin=ORIGIN)
+    messages = read_by_rosbags(tmp_path / "out.mcap")
+    assert sorted(messages) == ["/cam0/camera_info", "/cam0/image/compressed", "/gnss/fix", "/tf_static"]
+    files = sorted((dataset / "sequences" / "07" / "image_0").iterdir())
+    assert [m.data.tobytes() for m in messages["/cam0/image/compressed"]] == [path.read_bytes() for path in files]
+    assert tuple(messages["/cam0/camera_info"][0].k) == (50.0, 0.0, 31.0, 0.0, 50.0, 23.0, 0.0, 0.0, 1.0)
+    drive = open_drive(tmp_path / "out.mcap")
+    assert [(m.latitude, m.longitude, m.altitude) for m in messages["/gnss/fix"]] == [
+        (fix.lat_deg, fix.lon_deg, fix.height_m) for fix in drive.gnss_fixes()
+    ]
+    assert (done.frame_count, done.fix_count) == (FRAMES, len(messages["/gnss/fix"]))
+    stamps_ns = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in messages["/cam0/image/compressed"]]
+    assert stamps_ns == [START_NS + index * 103_700_000 for index in range(FRAMES)]
+
+
 def test_a_sequence_without_a_site_has_neither_reference_nor_gnss(dataset, tmp_path):
     done = convert_kitti_odometry(dataset, tmp_path / "out.mcap", sequence="07")
     assert done.reference is None
