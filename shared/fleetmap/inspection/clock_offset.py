@@ -16,10 +16,10 @@ MAX_OFFSET_S = 1.0  # larger ones are not searched for
 MAX_SIGMA_S = 0.05  # less certain than this is not an answer
 _MIN_STRETCH_S = 4.0
 _MIN_FIXES = 4
-_STARTS_S = (-0.8, -0.4, 0.0, 0.4, 0.8)
+_STARTS_S = (-0.6, 0.0, 0.6)
 _END_MARGIN_S = 0.2  # fixes closer to the ends of a stretch may belong outside it
 _SIGMA_FLOOR_S = 0.003
-_KNOWN_LEVER_SIGMA_M, _ASSUMED_LEVER_SIGMA_M = 0.05, 1.0
+_LEVER_SIGMA_M, _ASSUMED_LEVER_SIGMA_M = 0.05, 1.0
 _SIGMA_RANGE_M = (0.02, 5.0)
 
 
@@ -71,11 +71,7 @@ def _fit(course: VisualCourse, track: GnssTrack, antenna: Antenna) -> PathFit | 
     fixes = _fixes_during(course, track)
     if len(fixes.times_s) < _MIN_FIXES:
         return None
-    is_known = antenna.source != "assumed at the camera"
-    lever = Lever(
-        course.forward_left_from_cam @ antenna.position_in_cam_m,
-        _KNOWN_LEVER_SIGMA_M if is_known else _ASSUMED_LEVER_SIGMA_M,
-    )
+    lever = Lever(course.forward_left_from_cam @ antenna.position_in_cam_m, _LEVER_SIGMA_M)
     found = [fit for start in _STARTS_S if (fit := fit_path(course, fixes, lever, start)) is not None]
     within = [fit for fit in found if abs(fit.offset_s) <= MAX_OFFSET_S]
     return min(within, key=lambda fit: fit.cost, default=None)
@@ -90,9 +86,12 @@ def _combined(fits: list[PathFit], antenna: Antenna) -> ClockOffset:
     disagreement = float((weights * (offsets - offset_s) ** 2).sum()) / max(len(fits) - 1, 1)
     sigma_s = float(np.sqrt(max(disagreement, 1.0) / weights.sum()))
     scatter_m = float(np.median([fit.scatter_m for fit in fits]))
-    if sigma_s <= MAX_SIGMA_S:
-        return ClockOffset(offset_s, sigma_s, None, scatter_m)
-    reason = f"the turns determine it to {sigma_s:.2f} s only"
+    found = f"{offset_s:.3f} +- {sigma_s:.3f} s"
     if antenna.source == "assumed at the camera":
-        reason += "; not knowing where the antenna is, one cannot tell a late clock from an antenna further back"
-    return _unobservable(reason, scatter_m)
+        speed_mps = float(np.median([fit.speed_mps for fit in fits]))
+        sigma_s = float(np.hypot(sigma_s, _ASSUMED_LEVER_SIGMA_M / max(speed_mps, 1e-3)))
+        if sigma_s > MAX_SIGMA_S:
+            return _unobservable(f"it is {found} if the antenna is at the camera, but nothing says so", scatter_m)
+    if sigma_s > MAX_SIGMA_S:
+        return _unobservable(f"the turns determine it to {sigma_s:.2f} s only", scatter_m)
+    return ClockOffset(offset_s, sigma_s, None, scatter_m)

@@ -7,7 +7,7 @@ on the camera's clock, and should lie at
 
 with a speed v of white jerk, a correction b of the visual course that wanders as a random walk, and an error e of
 the receiver that wanders likewise. All unknowns (d, v, b, lever, e) are found together by Gauss-Newton with
-Huber's weights, so the offset's sigma holds all that it could be confused with: on a straight at constant speed
+Cauchy's weights, so the offset's sigma holds all that it could be confused with: on a straight at constant speed
 a later clock looks like a shifted start, and the sigma says so.
 """
 
@@ -27,7 +27,7 @@ _JERK_MPS3 = 1.0  # per square root of a second
 _COURSE_WALK_RAD = np.radians(0.2)  # per square root of a second: drift of frame-to-frame rotations
 _ERROR_TIME_CONSTANT_S = 100.0  # over which a receiver's error changes by its own sigma
 _ITERATIONS = 12
-_HUBER = 1.5
+_CAUCHY = 2.0
 _PRIOR_FREEDOM = 4.0  # how many measurements the reported sigma counts for
 
 
@@ -45,7 +45,7 @@ class Lever:
     """The antenna in the vehicle's level frame, and how well that is known."""
 
     forward_left_m: Array  # (2,)
-    sigma_m: float
+    sigma_m: float  # small against a metre: a long unknown lever can hardly be told from an offset
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,7 @@ class PathFit:
     offset_s: float
     sigma_s: float
     scatter_m: float  # per axis
+    speed_mps: float
     cost: float
 
 
@@ -66,7 +67,8 @@ def fit_path(course: VisualCourse, fixes: Fixes, lever: Lever, start_offset_s: f
     noise_m = scatter_m  # of one fix, if all were independent
     for _ in range(_ITERATIONS):
         residuals, jacobian = problem.linearise(unknowns)
-        weights = _huber(residuals, noise_m)
+        noise_m = max(noise_m, _spread(residuals))  # while far off, nothing is an outlier
+        weights = _cauchy(residuals, noise_m)
         prior_residuals, prior_jacobian = problem.priors(unknowns)
         weighted = jacobian * weights[:, None]
         measured = weighted.T @ jacobian
@@ -80,28 +82,33 @@ def fit_path(course: VisualCourse, fixes: Fixes, lever: Lever, start_offset_s: f
         step *= min(1.0, 0.3 / max(abs(float(step[0])), 1e-12))
         unknowns = unknowns + step
         used = float(np.trace(covariance @ measured))
-        scatter_m = _scatter_m(residuals, weights * noise_m**2, used, fixes.sigma_m)
+        scatter_m = _scatter_m(residuals, used, fixes.sigma_m)
         noise_m = scatter_m * np.sqrt(_correlated_count(residuals))
     cost = float((weights * residuals**2).sum() + (prior_residuals**2).sum())
     cost += 2.0 * len(residuals) * float(np.log(noise_m))
     if not np.all(np.isfinite(unknowns)) or covariance[0, 0] <= 0.0:
         return None
-    return PathFit(float(unknowns[0]), float(np.sqrt(covariance[0, 0])), scatter_m, cost)
+    sigma_s = float(np.sqrt(covariance[0, 0]))
+    return PathFit(float(unknowns[0]), sigma_s, scatter_m, problem.speed_mps(unknowns), cost)
 
 
-def _huber(residuals: Array, scatter_m: float) -> Array:
+def _cauchy(residuals: Array, scatter_m: float) -> Array:
     """Weights (2 M,) for residuals that hold all eastings, then all northings; in 1/m^2."""
     distance = np.hypot(*residuals.reshape(2, -1)) / scatter_m
-    weights = np.minimum(1.0, _HUBER / np.maximum(distance, 1e-9)) / scatter_m**2
-    return np.tile(weights, 2)
+    return np.tile(1.0 / (1.0 + (distance / _CAUCHY) ** 2) / scatter_m**2, 2)
 
 
-def _scatter_m(residuals: Array, weights: Array, used: float, reported_m: float) -> float:
+def _spread(residuals: Array) -> float:
+    """Standard deviation, by the median."""
+    return 1.4826 * float(np.median(np.abs(residuals)))
+
+
+def _scatter_m(residuals: Array, used: float, reported_m: float) -> float:
     """White noise of the fixes from what the fit leaves, with the reported sigma as a weak prior.
 
-    ``weights`` are between 0 and 1; ``used`` is the number of measurements that the unknowns have taken up.
+    ``used`` is the number of measurements that the unknowns have taken up.
     """
-    squares = float((weights * residuals**2).sum()) + _PRIOR_FREEDOM * reported_m**2
+    squares = len(residuals) * _spread(residuals) ** 2 + _PRIOR_FREEDOM * reported_m**2
     freedom = max(len(residuals) - used, 0.0) + _PRIOR_FREEDOM
     return max(float(np.sqrt(squares / freedom)), 0.003)
 
@@ -109,7 +116,7 @@ def _scatter_m(residuals: Array, weights: Array, used: float, reported_m: float)
 def _correlated_count(residuals: Array) -> float:
     """How many successive fixes say the same: 1 + 2 sum of their autocorrelation, up to its first zero."""
     left = residuals.reshape(2, -1)
-    left = np.clip(left, *(np.array([-3.0, 3.0]) * 1.5 * float(np.median(np.abs(left)))))
+    left = np.clip(left, -3.0 * _spread(residuals), 3.0 * _spread(residuals))
     power = float((left * left).sum())
     count = 1.0
     for lag in range(1, left.shape[1] // 4):
@@ -190,6 +197,11 @@ class _Problem:
                 np.hstack([by_offset[:, axis, None], by_lever, by_speed, by_course, *by_error[:: 1 - 2 * axis]])
             )
         return np.concatenate(residuals), np.vstack(rows)
+
+    def speed_mps(self, unknowns: Array) -> float:
+        """The mean speed."""
+        at = self._offsets()
+        return float(np.mean(np.abs(unknowns[at[2] : at[3]])))
 
     def priors(self, unknowns: Array) -> tuple[Array, Array]:
         """Residuals in sigmas, and their derivatives."""
