@@ -283,6 +283,29 @@ except StorageError as error:
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_long_recording_is_written_in_bounded_memory(tmp_path):
+    """200 MB of images and depth pass through the writer while the process grows by less than 20 MB."""
+    script = """
+import resource, sys
+from pathlib import Path
+import numpy as np
+from fleetmap.camera import Camera
+from fleetmap.drives.ros2_writer import DriveWriter
+png, depth_m = np.random.default_rng(0).bytes(300_000), np.ones((480, 640), dtype=np.float32)
+with DriveWriter(Path(sys.argv[1]), Camera(640, 480, 500.0, 500.0, 320.0, 240.0), compress_chunks=True) as writer:
+    for index in range(220):
+        if index == 20:
+            before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        writer.write_png(10**18 + index, png)
+        writer.write_depth(10**18 + index, depth_m)
+print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1e3)
+"""
+    path = tmp_path / "long.mcap"
+    done = subprocess.run([sys.executable, "-c", script, str(path)], capture_output=True, text=True, check=True)
+    assert path.stat().st_size > 40e6
+    assert float(done.stdout) < 20.0
+
+
 def test_a_recording_can_lack_calibration(tmp_path, pictures):
     with DriveWriter(tmp_path / "drive.mcap", None) as writer:
         writer.write_image(T0_NS, pictures[0])
