@@ -18,9 +18,13 @@ from fleetmap.errors import FleetmapError
 # verb -> (module:command, one line for `fleetmap --help`, the extra that installs what it needs)
 VERBS: dict[str, tuple[str, str, str]] = {
     "demo": ("demo:demo", "Simulate, map, serve, localise and judge one short street.", "all"),
-    "convert": ("convert:convert", "Turn a public data set's folder into an MCAP recording.", "recordings"),
-    "simulate": ("simulate:simulate", "Simulate a drive with the truth known.", "all"),
-    "info": ("info:info", "Say what a recording holds and what it lacks.", "recordings"),
+    "convert": (
+        "convert:convert",
+        "Turn a folder of images and measurements into an MCAP recording.",
+        "recordings",
+    ),
+    "simulate": ("simulate:simulate", "Simulate a drive with the truth known.", "simulation"),
+    "info": ("info:info", "Say what a recording holds and whether it is good enough to map.", "recordings"),
     "map": ("map:map_", "Turn a survey drive into a map anchored in UTM.", "mapper"),
     "serve": ("serve:serve", "Run the map server (Zenoh and HTTP).", "server"),
     "publish": ("publish:publish", "Send a map to the server.", "server"),
@@ -31,6 +35,7 @@ VERBS: dict[str, tuple[str, str, str]] = {
         "localizer",
     ),
     "evaluate": ("evaluate:evaluate", "Judge a trajectory against a reference or a map.", "all"),
+    "benchmark": ("benchmark:benchmark", "Measure a part and write table, figures and pictures.", "all"),
 }
 
 _EPILOG = (
