@@ -10,6 +10,9 @@ _JPEG_QUALITY = 95
 _JPEG_START, _JPEG_SCAN, _JPEG_END = b"\xff\xd8", b"\xff\xda", b"\xff\xd9"
 _PNG_START, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 _RIFF_START, _WEBP_MARK = b"RIFF", b"WEBP"
+_JPEG_WITHOUT_LENGTH = frozenset({0x01, *range(0xD0, 0xD9)})
+_JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # ITU-T T.81, table B.1: they tell the size
+_PIXEL_LIMIT = 100_000_000  # a damaged header can claim 4 gigapixels, and the decoder would make room for them
 
 Image = NDArray[np.uint8]
 
@@ -31,6 +34,9 @@ def decode_compressed(data: bytes, image_format: str) -> Image:
         raise ValueError(f"it is neither JPEG nor PNG nor WebP (format '{image_format}')")
     if not is_whole:
         raise ValueError(f"its {len(data)} bytes end in the middle of the image")
+    width, height = _claimed_size(data)
+    if width * height > _PIXEL_LIMIT:
+        raise ValueError(f"it claims {width}x{height} pixels; {_PIXEL_LIMIT:,} are read at most")
     try:
         image = cv2.imdecode(
             np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
@@ -40,6 +46,20 @@ def decode_compressed(data: bytes, image_format: str) -> Image:
     if image is None:
         raise ValueError(f"the decoder refuses its {len(data)} bytes")
     return np.asarray(image, dtype=np.uint8)
+
+
+def _claimed_size(data: bytes) -> tuple[int, int]:
+    """Width and height by the header of a JPEG or PNG; zeros where it does not say (a WebP cannot claim much)."""
+    if data.startswith(_PNG_START):
+        return int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
+    at = 2 if data.startswith(_JPEG_START) else len(data)
+    while at + 9 <= len(data) and data[at] == 0xFF:
+        marker = data[at + 1]
+        if marker in _JPEG_FRAMES:
+            return int.from_bytes(data[at + 7 : at + 9], "big"), int.from_bytes(data[at + 5 : at + 7], "big")
+        is_short = marker == 0xFF or marker in _JPEG_WITHOUT_LENGTH
+        at += (1 if marker == 0xFF else 2) if is_short else 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    return 0, 0
 
 
 def encode_image(image: Image, *, png: bool = False) -> bytes:

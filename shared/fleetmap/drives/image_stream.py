@@ -81,7 +81,10 @@ class _VideoStream:
         if not self._has_begun:
             raise DriveError(f"the video on {self._source} has no keyframe; not one picture can be decoded")
         if self._stamps_ns:
-            _log.warning("%s: %d video messages gave no picture", self._source, len(self._stamps_ns))
+            _log.warning(
+                "%s: %d video messages gave no picture, because others before them are missing",
+                self._source, len(self._stamps_ns),
+            )  # fmt: skip
 
     def _stamped(self, number: int, image: Image) -> DecodedImage:
         if not self._has_begun:

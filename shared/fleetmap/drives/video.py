@@ -3,6 +3,9 @@
 Source: https://docs.foxglove.dev/docs/sdk/schemas/compressed-video. A message holds what makes one picture out of
 those before it, so decoding starts at a keyframe. B-frames are not allowed in such recordings; where some are
 there, pictures come out late and in the order of display, and still with their own number.
+
+Where messages were lost, decoding starts again at the next keyframe. H.264's decoder has to be told of that, H.265's
+notices by itself; in VP9 and AV1 nothing tells.
 """
 
 from __future__ import annotations
@@ -12,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from fleetmap.drives.h264_gaps import LostPictures
 from fleetmap.drives.image_codec import Image
 from fleetmap.errors import DriveError
 
@@ -34,10 +38,9 @@ class VideoDecoder:
         name = _DECODERS.get(video_format.strip().lower())
         if name is None:
             raise ValueError(f"video format '{video_format}' is not one of {', '.join(_DECODERS)}")
-        self._av = _pyav()
-        self._decoder = self._av.CodecContext.create(name, "r")
-        self._decoder.thread_count = 1  # more threads hold pictures back
-        self._has_begun = False
+        self._av, self._name = _pyav(), name
+        self._lost = LostPictures() if name == "h264" else None
+        self._start()
 
     def decode(self, number: int, data: bytes) -> list[tuple[int, Image]]:
         """The pictures, grey (height, width), that a message completes; none before the first keyframe.
@@ -45,22 +48,31 @@ class VideoDecoder:
         Raises:
             ValueError: damaged data.
         """
+        held_back: list[tuple[int, Image]] = []
+        if self._lost is not None and self._lost.are_before(data):
+            held_back = self.finish()
+            self._start()
+        if not data:
+            raise ValueError("it is empty")
         packet = self._av.Packet(data)
         packet.pts = number
         try:
-            frames = self._decoder.decode(packet) if data else []
+            frames = self._decoder.decode(packet)
         except self._av.FFmpegError as error:
             if self._has_begun:
                 raise ValueError(f"the decoder refuses its {len(data)} bytes ({error.strerror})") from error
-            return []
-        if not data and self._has_begun:
-            raise ValueError("it is empty")
+            return held_back
         self._has_begun = self._has_begun or bool(frames)
-        return [_picture(frame) for frame in frames]
+        return held_back + [_picture(frame) for frame in frames]
 
     def finish(self) -> list[tuple[int, Image]]:
         """The pictures that the decoder held back."""
         return [_picture(frame) for frame in self._decoder.decode(None)] if self._has_begun else []
+
+    def _start(self) -> None:
+        self._decoder: av.VideoCodecContext = self._av.CodecContext.create(self._name, "r")
+        self._decoder.thread_count = 1  # more threads hold pictures back
+        self._has_begun = False
 
 
 def _picture(frame: av.VideoFrame) -> tuple[int, Image]:

@@ -14,6 +14,7 @@ from foxglove_schemas_protobuf.CompressedVideo_pb2 import CompressedVideo
 from google.protobuf.timestamp_pb2 import Timestamp
 
 from fleetmap.drives import open_drive
+from fleetmap.drives.h264_gaps import LostPictures
 from fleetmap.errors import DriveError
 
 T0_NS = 1_650_000_000_123_456_789
@@ -35,7 +36,7 @@ def pictures_of(count=COUNT):
     pictures = []
     for index in range(count):
         picture = np.full((HEIGHT, WIDTH), 30 + 5 * index, np.uint8)
-        picture[:, 16 * index : 16 * index + 16] = 240
+        picture[:, 8 * index : 8 * index + 16] = 240
         pictures.append(picture)
     return pictures
 
@@ -101,6 +102,48 @@ def test_what_comes_before_the_first_keyframe_is_skipped_and_counted(record_vide
         assert_are(list(drive.frames()), pictures, range(10, COUNT))
     (warning,) = caplog.records
     assert "before its first keyframe; the first 7 messages are skipped" in warning.getMessage()
+
+
+@pytest.mark.parametrize("video_format", ["h264", "h265"])
+@pytest.mark.parametrize("lost", [(4,), (3, 4, 5), (10,), (9, 10, 11)])
+def test_after_lost_messages_nothing_is_made_up(record_video, video_format, lost, caplog):
+    pictures = pictures_of(40)
+    packets = packets_of(video_format, pictures)
+    path = record_video([packet for packet in packets if packet[0] not in lost], video_format)
+    with caplog.at_level(logging.WARNING):
+        frames = list(open_drive(path).frames())
+    following_keyframe = 10 * (lost[-1] // 10 + 1)
+    expected = [*range(lost[0]), *range(following_keyframe, 40)]
+    assert_are(frames, pictures, expected)
+    (warning,) = caplog.records
+    assert f"{40 - len(lost) - len(expected)} video messages gave no picture" in warning.getMessage()
+
+
+@pytest.mark.parametrize("profile", ["baseline", "main", "high", "high10", "high422", "high444"])
+def test_a_whole_h264_stream_of_any_profile_has_no_gaps(profile):
+    pixel_format = {"high10": "yuv420p10le", "high422": "yuv422p", "high444": "yuv444p"}.get(profile, "yuv420p")
+    options = {"preset": "medium", "profile": profile, "x264-params": "cqm=jvt:bframes=0:keyint=30"}
+    if profile in ("baseline", "main"):
+        options["x264-params"] = "bframes=0:keyint=30"
+    packets = [data for _, data in packets_of("h264", pictures_of(45), pixel_format=pixel_format, **options)]
+    assert len(packets) == 45
+    whole = LostPictures()
+    assert not any([whole.are_before(data) for data in packets])
+    torn = LostPictures()
+    assert [number for number, data in enumerate(packets) if number != 7 and torn.are_before(data)] == [8]
+
+
+def test_b_frames_are_no_gaps():
+    packets = packets_of("h264", pictures_of(40), b_frames=3, preset="medium", tune="psnr")
+    whole = LostPictures()
+    assert not any([whole.are_before(data) for _, data in packets])
+
+
+def test_what_is_no_h264_has_no_gaps():
+    rng = np.random.default_rng(5)
+    stream = LostPictures()
+    for data in (b"", b"\0\0\1", b"\0\0\1\x67", b"\0\0\1\x67\x64", *(rng.bytes(300) for _ in range(50))):
+        assert not stream.are_before(data)
 
 
 def test_pictures_that_the_decoder_holds_back_come_at_the_end(record_video):
