@@ -26,6 +26,7 @@ from fleetmap.errors import DriveError
 _log = logging.getLogger(__name__)
 
 _NAMED_GAPS = 3  # a warning lists no more of them
+_told: set[tuple[str, int, int]] = set()  # damaged files that were warned about: some are opened more than once
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,6 @@ class McapFile:
         with self._opened() as file:
             _check_start(path, file)
             self._index = index_of_summary(file) or scan(file)
-        self._has_told = False
         self._check_something_is_left()
         self.topics = _topics_of(self._index)
 
@@ -110,8 +110,10 @@ class McapFile:
 
     def _tell_what_is_missing(self) -> None:
         """One warning a file, as soon as its messages are asked for."""
-        if not self._has_told and (losses := _losses(self._index)):
-            self._has_told = True
+        state = self.path.stat()
+        file = (str(self.path.resolve()), state.st_size, state.st_mtime_ns)
+        if file not in _told and (losses := _losses(self._index)):
+            _told.add(file)
             _log.warning(
                 "recording %s %s; %d messages are read", self.path, "; it ".join(losses), self._index.message_count
             )

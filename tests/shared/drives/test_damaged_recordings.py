@@ -107,6 +107,7 @@ def test_a_cut_recording_is_a_drive_with_one_warning_that_counts(street, caplog)
     assert len(drive.gnss_fixes()) == 7
     assert drive.antenna().source == "static transform"
     assert len(list(drive.frames())) == 7
+    assert len(list(open_drive(path).frames())) == 7
     (warning,) = warnings_of(caplog)
     assert f"recording {path} was not finished" in warning
     assert " 131 bytes at its end are left out; 23 messages are read" in warning  # 100 and the message's header
