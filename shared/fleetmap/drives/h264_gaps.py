@@ -1,7 +1,7 @@
 """Notices that pictures of an H.264 stream were lost: the decoder itself would make up what they showed.
 
 Reference pictures are numbered (``frame_num``); a number that is skipped is a picture that never arrived.
-Source: ITU-T H.264, sections 7.3.2.1.1 (sequence parameter set), 7.3.3 (slice header), 7.4.3 (gaps) and 9.1 (codes).
+Source: ITU-T H.264, sections 7.3.2.1.1 (sequence parameter set), 7.3.3 (slice header), 7.4.3 (gaps), 9.1 (codes).
 """
 
 from __future__ import annotations

@@ -4,8 +4,8 @@ Source: https://docs.foxglove.dev/docs/sdk/schemas/compressed-video. A message h
 those before it, so decoding starts at a keyframe. B-frames are not allowed in such recordings; where some are
 there, pictures come out late and in the order of display, and still with their own number.
 
-Where messages were lost, decoding starts again at the next keyframe. H.264's decoder has to be told of that, H.265's
-notices by itself; in VP9 and AV1 nothing tells.
+Where messages were lost, decoding starts again at the next keyframe. The decoder of H.264 has to be told of that,
+the one of H.265 notices by itself; in VP9 and AV1 nothing tells.
 """
 
 from __future__ import annotations
@@ -40,7 +40,8 @@ class VideoDecoder:
             raise ValueError(f"video format '{video_format}' is not one of {', '.join(_DECODERS)}")
         self._av, self._name = _pyav(), name
         self._lost = LostPictures() if name == "h264" else None
-        self._start()
+        self._decoder = self._new_decoder()
+        self._has_begun = False
 
     def decode(self, number: int, data: bytes) -> list[tuple[int, Image]]:
         """The pictures, grey (height, width), that a message completes; none before the first keyframe.
@@ -51,7 +52,8 @@ class VideoDecoder:
         held_back: list[tuple[int, Image]] = []
         if self._lost is not None and self._lost.are_before(data):
             held_back = self.finish()
-            self._start()
+            self._decoder = self._new_decoder()
+            self._has_begun = False
         if not data:
             raise ValueError("it is empty")
         packet = self._av.Packet(data)
@@ -69,10 +71,10 @@ class VideoDecoder:
         """The pictures that the decoder held back."""
         return [_picture(frame) for frame in self._decoder.decode(None)] if self._has_begun else []
 
-    def _start(self) -> None:
-        self._decoder: av.VideoCodecContext = self._av.CodecContext.create(self._name, "r")
-        self._decoder.thread_count = 1  # more threads hold pictures back
-        self._has_begun = False
+    def _new_decoder(self) -> av.VideoCodecContext:
+        decoder: av.VideoCodecContext = self._av.CodecContext.create(self._name, "r")
+        decoder.thread_count = 1  # more threads hold pictures back
+        return decoder
 
 
 def _picture(frame: av.VideoFrame) -> tuple[int, Image]:
