@@ -9,7 +9,8 @@ import numpy as np
 
 from fleetmap.drive import Antenna
 from fleetmap.inspection.gnss_quality import GnssTrack
-from fleetmap.inspection.path_fit import Fixes, Lever, PathFit, fit_path
+from fleetmap.inspection.path_fit import PathFit, fit_path
+from fleetmap.inspection.path_model import Fixes, Lever
 from fleetmap.inspection.visual_course import TURN_RAD, TimedMotion, VisualCourse, turning_courses
 
 MAX_OFFSET_S = 1.0  # larger ones are not searched for
