@@ -38,7 +38,10 @@ def choose_image_topic(mcap: McapFile, wanted: str | None) -> str:
             f" (CompressedImage, RawImage or CompressedVideo in protobuf); it holds {_held(mcap)}"
         )
     if wanted is not None:
-        return _wanted(mcap, wanted, candidates, "images")
+        chosen = _wanted(mcap, wanted, candidates, "images")
+        if is_depth(first_value(mcap, IMAGES, chosen)):
+            raise DriveError(f"{chosen} in {mcap.path} holds depth images, not a camera's; choose another topic")
+        return chosen
     of_cameras = [topic for topic in candidates if _is_of_camera(mcap, topic, has_rivals=len(candidates) > 1)]
     if not of_cameras:
         raise DriveError(f"{mcap.path} holds depth images only ({', '.join(candidates)}), no camera's images")
@@ -58,7 +61,7 @@ def choose_gnss_topic(mcap: McapFile, wanted: str | None) -> str | None:
     """
     candidates = topics_of(mcap, FIXES)
     if wanted is not None:
-        return _wanted(mcap, wanted, candidates, "NavSatFix messages")
+        return _wanted(mcap, wanted, candidates, "GNSS fixes")
     if len(candidates) > 1:
         raise DriveError(
             f"{mcap.path} holds {len(candidates)} GNSS topics: {', '.join(candidates)};"

@@ -311,7 +311,7 @@ class TestFixes:
         assert [fix.stamp_ns for fix in drive.gnss_fixes()] == [T0_NS + 1]
 
     def test_an_unknown_gnss_topic_is_refused_at_once(self, fixes_of):
-        with pytest.raises(DriveError, match=r"no NavSatFix messages on /c; it has /a/fix"):
+        with pytest.raises(DriveError, match=r"no GNSS fixes on /c; it has /a/fix"):
             fixes_of({"topic": "/a/fix"}, gnss_topic="/c")
 
     def test_a_recording_without_gnss_has_no_fixes_and_no_warning(self, fixes_of, caplog):

@@ -64,6 +64,14 @@ def test_a_recording_of_depth_alone_has_no_images(record, write_depth, encoding)
         open_drive(recorder.path)
 
 
+@pytest.mark.parametrize(("write_depth", "encoding"), DEPTH)
+def test_depth_is_no_camera_also_when_it_is_asked_for(with_colour, write_depth, encoding):
+    path = with_colour(lambda recorder: write_depth(recorder, encoding))
+    topic = "/camera/depth/image" if write_depth is raw_depth else "/camera/depth/image/compressedDepth"
+    with pytest.raises(DriveError, match=f"{topic} in .* holds depth images"):
+        open_drive(path, image_topic=topic)
+
+
 def test_a_second_camera_has_to_be_chosen_also_beside_depth(with_colour, pictures):
     def write(recorder):
         raw_depth(recorder, "16UC1")
