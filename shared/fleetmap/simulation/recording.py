@@ -73,7 +73,8 @@ def record_drive(
             write_markers(outputs.enter_context(atomic_path(markers)), drive.world)
         writer = outputs.enter_context(DriveWriter(path, drive.camera, force=force, camera_frame_id=CAMERA_FRAME))
         _write_mounting(writer, drive)
-        images = tqdm(desc=f"render {path.name}", total=drive.frame_count, unit="image", disable=not progress)
+        hidden = None if progress else True  # None: where stderr is a file or a pipe
+        images = tqdm(desc=f"render {path.name}", total=drive.frame_count, unit="image", disable=hidden)
         with images:
             for message in _messages(drive, workers):
                 message.write(writer)
