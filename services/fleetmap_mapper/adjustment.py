@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 
 from fleetmap.camera import Camera
 from fleetmap.geometry import nearest_rotations
+from fleetmap_mapper.schur_complement import solve_damped
 
 Array = NDArray[np.float64]
 
 HUBER_PX = 2.4477  # sqrt of the 95 % point of chi-square with 2 degrees of freedom
-_POSE_DOF, _POINT_DOF = 6, 3
+_MIN_DEPTH = 1e-6
 
 
 @dataclass(frozen=True)
@@ -50,13 +51,12 @@ class Adjusted:
 
 def adjust(problem: AdjustmentProblem, iterations: int = 10) -> Adjusted:
     """Move the free poses and all points to the (local) optimum."""
-    camera = problem.camera
     at_start = squared_errors(problem, problem.rotations, problem.translations, problem.points)
     # What starts behind its camera takes no part: a step that brought it to the front would look like progress.
     weights = np.where(np.isfinite(at_start), 1.0 / problem.sigmas_px, 0.0)
     starts = np.searchsorted(problem.point_index, np.arange(len(problem.points) + 1)).astype(np.int64)
     rotations, translations, points, cost = _levenberg_marquardt(
-        np.array([camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px]),
+        _intrinsics(problem.camera),
         np.ascontiguousarray(problem.rotations, dtype=np.float64),
         np.ascontiguousarray(problem.translations, dtype=np.float64),
         np.ascontiguousarray(problem.fixed),
@@ -74,11 +74,40 @@ def adjust(problem: AdjustmentProblem, iterations: int = 10) -> Adjusted:
 
 def squared_errors(problem: AdjustmentProblem, rotations: Array, translations: Array, points: Array) -> Array:
     """Squared normalised reprojection error of every observation (M,); inf behind the camera."""
-    k, p = problem.keyframe_index, problem.point_index
-    points_in_cam = np.einsum("mij,mj->mi", rotations[k], points[p]) + translations[k]
-    errors = problem.camera.project_ideal(points_in_cam) - problem.pixels
-    chi2 = (errors**2).sum(axis=1) / problem.sigmas_px**2
-    return np.where(np.isfinite(chi2), chi2, np.inf)
+    chi2: Array = _squared_errors(
+        _intrinsics(problem.camera),
+        np.ascontiguousarray(rotations, dtype=np.float64),
+        np.ascontiguousarray(translations, dtype=np.float64),
+        np.ascontiguousarray(points, dtype=np.float64),
+        problem.keyframe_index,
+        problem.point_index,
+        problem.pixels,
+        problem.sigmas_px,
+    )
+    return chi2
+
+
+def _intrinsics(camera: Camera) -> tuple[float, float, float, float]:
+    return camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _squared_errors(intrinsics, rotations, translations, points, keyframe_index, point_index, pixels, sigmas):  # type: ignore[no-untyped-def]
+    fx, fy, cx, cy = intrinsics
+    chi2 = np.full(len(pixels), np.inf)
+    for m in range(len(pixels)):
+        k, j = keyframe_index[m], point_index[m]
+        x, y, z = points[j, 0], points[j, 1], points[j, 2]
+        depth = rotations[k, 2, 0] * x + rotations[k, 2, 1] * y + rotations[k, 2, 2] * z + translations[k, 2]
+        if not depth > _MIN_DEPTH:
+            continue
+        across = rotations[k, 0, 0] * x + rotations[k, 0, 1] * y + rotations[k, 0, 2] * z + translations[k, 0]
+        down = rotations[k, 1, 0] * x + rotations[k, 1, 1] * y + rotations[k, 1, 2] * z + translations[k, 1]
+        du, dv = across / depth * fx + cx - pixels[m, 0], down / depth * fy + cy - pixels[m, 1]
+        square = (du * du + dv * dv) / (sigmas[m] * sigmas[m])
+        if np.isfinite(square):
+            chi2[m] = square
+    return chi2
 
 
 @njit(cache=True, nogil=True)
@@ -93,14 +122,15 @@ def _levenberg_marquardt(  # type: ignore[no-untyped-def]
             free += 1
     damping = 1e-4
     cost = _cost(intrinsics, rotations, translations, points, keyframe_index, starts, pixels, weights)
+    blocks = _empty_blocks(len(keyframe_index), len(points), free)
     for _ in range(iterations):
-        U, gp, V, gl, W = _normal_equations(
-            intrinsics, rotations, translations, points, keyframe_index, starts, pixels, weights, slots, free
+        _fill_normal_equations(
+            blocks, intrinsics, rotations, translations, points, keyframe_index, starts, pixels, weights, slots
         )
         improved = False
         decrease = 0.0
         for _ in range(6):
-            dp, dl = _solve(U, gp, V, gl, W, keyframe_index, starts, slots, free, damping)
+            dp, dl = solve_damped(blocks, keyframe_index, starts, slots, damping)
             new_rotations, new_translations = _moved(rotations, translations, slots, dp)
             new_points = points + dl
             new_cost = _cost(
@@ -130,7 +160,7 @@ def _cost(intrinsics, rotations, translations, points, keyframe_index, starts, p
             x = R[0, 0] * points[j, 0] + R[0, 1] * points[j, 1] + R[0, 2] * points[j, 2] + t[0]
             y = R[1, 0] * points[j, 0] + R[1, 1] * points[j, 1] + R[1, 2] * points[j, 2] + t[1]
             z = R[2, 0] * points[j, 0] + R[2, 1] * points[j, 1] + R[2, 2] * points[j, 2] + t[2]
-            if z < 1e-6:
+            if z < _MIN_DEPTH:
                 total += 1e6  # a step that takes a point behind its camera is never an improvement
                 continue
             du = (fx * x / z + cx - pixels[m, 0]) * weights[m]
@@ -141,123 +171,64 @@ def _cost(intrinsics, rotations, translations, points, keyframe_index, starts, p
 
 
 @njit(cache=True, nogil=True)
-def _normal_equations(  # type: ignore[no-untyped-def]
-    intrinsics, rotations, translations, points, keyframe_index, starts, pixels, weights, slots, free
+def _empty_blocks(observations, points, poses):  # type: ignore[no-untyped-def]
+    """Of J^T W J and the gradients: poses U, gp; points V, gl; mixed W, transposed."""
+    U, gp = np.zeros((poses, 6, 6)), np.zeros((poses, 6))
+    V, gl = np.zeros((points, 3, 3)), np.zeros((points, 3))
+    return U, gp, V, gl, np.empty((observations, 3, 6))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _fill_normal_equations(  # type: ignore[no-untyped-def]
+    blocks, intrinsics, rotations, translations, points, keyframe_index, starts, pixels, weights, slots
 ):
-    """Blocks of J^T W J and the gradients: poses U (F,6,6), gp; points V (P,3,3), gl; mixed W (M,6,3)."""
-    fx, fy, cx, cy = intrinsics
-    U, gp = np.zeros((free, 6, 6)), np.zeros((free, 6))
-    V, gl = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
-    W = np.zeros((len(keyframe_index), 6, 3))
-    Jp, Jl, r = np.zeros((2, 6)), np.zeros((2, 3)), np.zeros(2)
+    U, gp, V, gl, W = blocks
+    U[:], gp[:], V[:], gl[:] = 0.0, 0.0, 0.0, 0.0
     for j in range(len(points)):
+        point = (points[j, 0], points[j, 1], points[j, 2])
         for m in range(starts[j], starts[j + 1]):
-            if weights[m] == 0.0:
-                continue
             k = keyframe_index[m]
-            R, t = rotations[k], translations[k]
-            x = R[0, 0] * points[j, 0] + R[0, 1] * points[j, 1] + R[0, 2] * points[j, 2] + t[0]
-            y = R[1, 0] * points[j, 0] + R[1, 1] * points[j, 1] + R[1, 2] * points[j, 2] + t[1]
-            z = R[2, 0] * points[j, 0] + R[2, 1] * points[j, 1] + R[2, 2] * points[j, 2] + t[2]
-            if z < 1e-6:
+            depth, ru, rv, u_by_pose, v_by_pose, u_by_point, v_by_point = _linearised(
+                intrinsics, rotations[k], translations[k], point, (pixels[m, 0], pixels[m, 1]), weights[m]
+            )
+            if weights[m] == 0.0 or depth < _MIN_DEPTH:
+                W[m] = 0.0
                 continue
-            r[0] = (fx * x / z + cx - pixels[m, 0]) * weights[m]
-            r[1] = (fy * y / z + cy - pixels[m, 1]) * weights[m]
-            error = np.sqrt(r[0] * r[0] + r[1] * r[1])
-            root = weights[m] * (1.0 if error <= HUBER_PX else np.sqrt(HUBER_PX / error))
-            for c in range(2):
-                r[c] *= root / weights[m]
-            a, b = fx / z * root, fy / z * root
-            ax, by = -a * x / z, -b * y / z
-            # d pixel / d point_in_cam = [[a, 0, ax], [0, b, by]]; left perturbation of cam_from_world
-            Jp[0, 0], Jp[0, 1], Jp[0, 2] = ax * y, a * z - ax * x, -a * y
-            Jp[0, 3], Jp[0, 4], Jp[0, 5] = a, 0.0, ax
-            Jp[1, 0], Jp[1, 1], Jp[1, 2] = by * y - b * z, -by * x, b * x
-            Jp[1, 3], Jp[1, 4], Jp[1, 5] = 0.0, b, by
             for c in range(3):
-                Jl[0, c] = a * R[0, c] + ax * R[2, c]
-                Jl[1, c] = b * R[1, c] + by * R[2, c]
-            for c in range(3):
-                gl[j, c] += Jl[0, c] * r[0] + Jl[1, c] * r[1]
+                gl[j, c] += u_by_point[c] * ru + v_by_point[c] * rv
                 for d in range(3):
-                    V[j, c, d] += Jl[0, c] * Jl[0, d] + Jl[1, c] * Jl[1, d]
+                    V[j, c, d] += u_by_point[c] * u_by_point[d] + v_by_point[c] * v_by_point[d]
             s = slots[k]
             if s < 0:
                 continue
             for c in range(6):
-                gp[s, c] += Jp[0, c] * r[0] + Jp[1, c] * r[1]
+                gp[s, c] += u_by_pose[c] * ru + v_by_pose[c] * rv
                 for d in range(6):
-                    U[s, c, d] += Jp[0, c] * Jp[0, d] + Jp[1, c] * Jp[1, d]
+                    U[s, c, d] += u_by_pose[c] * u_by_pose[d] + v_by_pose[c] * v_by_pose[d]
                 for d in range(3):
-                    W[m, c, d] = Jp[0, c] * Jl[0, d] + Jp[1, c] * Jl[1, d]
-    return U, gp, V, gl, W
+                    W[m, d, c] = u_by_pose[c] * u_by_point[d] + v_by_pose[c] * v_by_point[d]
 
 
-@njit(cache=True, nogil=True)
-def _solve(U, gp, V, gl, W, keyframe_index, starts, slots, free, damping):  # type: ignore[no-untyped-def]
-    """One damped step: poses from the reduced camera system, points by back-substitution."""
-    S, b = np.zeros((6 * free, 6 * free)), np.zeros(6 * free)
-    for s in range(free):
-        for c in range(6):
-            b[6 * s + c] = -gp[s, c]
-            for d in range(6):
-                S[6 * s + c, 6 * s + d] = U[s, c, d]
-            S[6 * s + c, 6 * s + c] += damping * U[s, c, c] + 1e-9
-    V_inv = np.zeros_like(V)
-    Y = np.zeros((6, 3))
-    for j in range(len(V)):
-        V_inv[j] = _inverse_3x3(V[j], damping)
-        for m in range(starts[j], starts[j + 1]):
-            s = slots[keyframe_index[m]]
-            if s < 0:
-                continue
-            for c in range(6):
-                for d in range(3):
-                    Y[c, d] = (
-                        W[m, c, 0] * V_inv[j, 0, d] + W[m, c, 1] * V_inv[j, 1, d] + W[m, c, 2] * V_inv[j, 2, d]
-                    )
-                b[6 * s + c] += Y[c, 0] * gl[j, 0] + Y[c, 1] * gl[j, 1] + Y[c, 2] * gl[j, 2]
-            for n in range(starts[j], starts[j + 1]):
-                q = slots[keyframe_index[n]]
-                if q < s:  # the upper triangle is enough
-                    continue
-                for c in range(6):
-                    for d in range(6):
-                        S[6 * s + c, 6 * q + d] -= (
-                            Y[c, 0] * W[n, d, 0] + Y[c, 1] * W[n, d, 1] + Y[c, 2] * W[n, d, 2]
-                        )
-    for c in range(6 * free):
-        for d in range(c):
-            S[c, d] = S[d, c]
-    dp = np.linalg.solve(S, b).reshape(free, 6) if free else np.zeros((0, 6))
-    dl = np.zeros_like(gl)
-    rhs = np.zeros(3)
-    for j in range(len(V)):
-        for d in range(3):
-            rhs[d] = -gl[j, d]
-        for m in range(starts[j], starts[j + 1]):
-            s = slots[keyframe_index[m]]
-            if s >= 0:
-                for d in range(3):
-                    for c in range(6):
-                        rhs[d] -= W[m, c, d] * dp[s, c]
-        for c in range(3):
-            dl[j, c] = V_inv[j, c, 0] * rhs[0] + V_inv[j, c, 1] * rhs[1] + V_inv[j, c, 2] * rhs[2]
-    return dp, dl
+@njit(cache=True, nogil=True, error_model="numpy")
+def _linearised(intrinsics, R, t, point, pixel, weight):  # type: ignore[no-untyped-def]
+    """Depth, residuals and Jacobians of one observation, weighted by its sigma and Huber's root.
 
-
-@njit(cache=True, nogil=True)
-def _inverse_3x3(A, damping):  # type: ignore[no-untyped-def]
-    d = 1.0 + damping
-    a00, a11, a22 = A[0, 0] * d + 1e-12, A[1, 1] * d + 1e-12, A[2, 2] * d + 1e-12
-    a01, a02, a12 = A[0, 1], A[0, 2], A[1, 2]
-    c00, c01, c02 = a11 * a22 - a12 * a12, a02 * a12 - a01 * a22, a01 * a12 - a02 * a11
-    determinant = a00 * c00 + a01 * c01 + a02 * c02
-    inverse = np.empty((3, 3))
-    inverse[0, 0], inverse[0, 1], inverse[0, 2] = c00, c01, c02
-    inverse[1, 0], inverse[1, 1], inverse[1, 2] = c01, a00 * a22 - a02 * a02, a01 * a02 - a00 * a12
-    inverse[2, 0], inverse[2, 1], inverse[2, 2] = c02, inverse[1, 2], a00 * a11 - a01 * a01
-    return inverse / determinant
+    d pixel / d point_in_cam = [[a, 0, ax], [0, b, by]]; left perturbation of cam_from_world.
+    """
+    fx, fy, cx, cy = intrinsics
+    x = R[0, 0] * point[0] + R[0, 1] * point[1] + R[0, 2] * point[2] + t[0]
+    y = R[1, 0] * point[0] + R[1, 1] * point[1] + R[1, 2] * point[2] + t[1]
+    z = R[2, 0] * point[0] + R[2, 1] * point[1] + R[2, 2] * point[2] + t[2]
+    ru, rv = (fx * x / z + cx - pixel[0]) * weight, (fy * y / z + cy - pixel[1]) * weight
+    error = np.sqrt(ru * ru + rv * rv)
+    root = 1.0 if error <= HUBER_PX else np.sqrt(HUBER_PX / error)
+    a, b = fx / z * (weight * root), fy / z * (weight * root)
+    ax, by = -a * x / z, -b * y / z
+    u_by_pose = (ax * y, a * z - ax * x, -a * y, a, 0.0, ax)
+    v_by_pose = (by * y - b * z, -by * x, b * x, 0.0, b, by)
+    u_by_point = (a * R[0, 0] + ax * R[2, 0], a * R[0, 1] + ax * R[2, 1], a * R[0, 2] + ax * R[2, 2])
+    v_by_point = (b * R[1, 0] + by * R[2, 0], b * R[1, 1] + by * R[2, 1], b * R[1, 2] + by * R[2, 2])
+    return z, root * ru, root * rv, u_by_pose, v_by_pose, u_by_point, v_by_point
 
 
 @njit(cache=True, nogil=True)
