@@ -14,6 +14,7 @@ from fleetmap.inspection.gnss_quality import spaced
 from fleetmap.inspection.visual_course import VisualCourse
 
 Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
 
 _SPEED_KNOT_S, _COURSE_KNOT_S, _ERROR_KNOT_S = 0.5, 1.0, 2.0
 _JERK_MPS3 = 1.0  # per square root of a second
@@ -30,7 +31,7 @@ class Fixes:
     sigma_m: float  # what the receiver reports, per axis
 
     @property
-    def complex_m(self) -> NDArray[np.complex128]:
+    def complex_m(self) -> Complex:
         """The positions (M,) as complex numbers."""
         return np.asarray(self.positions_m[:, 0] + 1j * self.positions_m[:, 1])
 
@@ -69,7 +70,8 @@ class PathModel:
         unknowns[lever] = self.lever.forward_left_m
         unknowns[speed] = _speeds_mps(times_s, self.fixes.positions_m, self.speed_knots_s)
         speeds = _hats(self.speed_knots_s, self._middles_s()) @ unknowns[speed]
-        path = _elapsed_s(self.course.times_s, times_s) @ (speeds * np.exp(1j * self.course.course_rad))
+        steps = speeds * np.exp(1j * self.course.course_rad)
+        path = _real_times_complex(_elapsed_s(self.course.times_s, times_s), steps[:, None]).ravel()
         turn = np.angle(np.vdot(path - path.mean(), points - points.mean()))
         unknowns[correction] = turn
         shift = (points - path * np.exp(1j * turn)).mean()
@@ -89,12 +91,15 @@ class PathModel:
         arm = forward * complex(*unknowns[lever])
         elapsed_s = _elapsed_s(course.times_s, times_s)
         error = error_hats @ (unknowns[east] + 1j * unknowns[north])
-        residuals = elapsed_s @ (speeds * directions) + arm + error - self.fixes.complex_m
+        velocities = speeds * directions
+        way = _real_times_complex(elapsed_s, velocities[:, None]).ravel()
+        residuals = way + arm + error - self.fixes.complex_m
         now = np.clip(np.searchsorted(course.times_s, times_s) - 1, 0, len(speeds) - 1)
         turn_rate = np.diff(course.heading_rad) / np.diff(course.times_s)
-        by_offset = (speeds * directions)[now] + 1j * turn_rate[now] * arm
-        by_speed = elapsed_s @ (directions[:, None] * speed_hats)
-        by_correction = elapsed_s @ ((speeds * directions)[:, None] * course_hats) + arm[:, None] * heading_hats
+        by_offset = velocities[now] + 1j * turn_rate[now] * arm
+        by_speed = _real_times_complex(elapsed_s, directions[:, None] * speed_hats)
+        by_correction = _real_times_complex(elapsed_s, velocities[:, None] * course_hats)
+        by_correction += arm[:, None] * heading_hats
         columns = [by_offset, forward, 1j * forward, by_speed, 1j * by_correction, error_hats, 1j * error_hats]
         jacobian = np.column_stack(columns)
         return np.concatenate([residuals.real, residuals.imag]), np.vstack([jacobian.real, jacobian.imag])
@@ -139,6 +144,11 @@ class PathModel:
             slice(correction, east),
             slice(east, north),
         )
+
+
+def _real_times_complex(real: Array, other: Complex) -> Complex:
+    """The product (M, K) of matrices (M, N) and (N, K); numpy's own is slow for mixed kinds."""
+    return np.asarray((real @ np.ascontiguousarray(other).view(np.float64)).view(np.complex128))
 
 
 def _knots(duration_s: float, step_s: float) -> Array:
