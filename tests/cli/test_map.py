@@ -240,7 +240,7 @@ def test_the_agent_publishes_what_is_dropped_in_and_holds_back_what_is_unfit(
     agent = start_agent(drives, map_server)
     shutil.copy(patchy_drive, drives / "Patchy Road.mcap")
     shutil.copy(short_drive, drives / "short.mcap")
-    (drives / "broken.mcap").write_bytes(short_drive.read_bytes()[:100_000] + short_drive.read_bytes()[-8:])
+    (drives / "broken.mcap").write_bytes(short_drive.read_bytes()[:60] + short_drive.read_bytes()[-8:])
     records = {name: drives / ".fleetmap" / f"{name}.mcap.json" for name in ("Patchy Road", "short", "broken")}
     wait_until(lambda: all(path.exists() for path in records.values()), agent)
     assert agent.stop() == 0
@@ -252,7 +252,7 @@ def test_the_agent_publishes_what_is_dropped_in_and_holds_back_what_is_unfit(
         "broken": "failed",
     }
     assert record["Patchy Road"]["reason"] == "only 32 of 40 images could be posed"
-    assert "is damaged" in record["broken"]["reason"]
+    assert "no message in it can be read" in record["broken"]["reason"]
     assert "Traceback" not in agent.said
     code, out, _ = fleetmap("maps", "list", "--server", map_server, "--json")
     assert code == 0
