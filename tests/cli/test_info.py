@@ -82,3 +82,44 @@ def test_help_teaches_by_example(fleetmap):
     code, out, _ = fleetmap("info", "--help")
     assert code == 0
     assert "Example: fleetmap info survey.mcap" in out
+
+
+def test_a_constant_grey_street_is_not_good_enough_to_map(fleetmap, recording):
+    code, out, _ = fleetmap("info", recording)
+    assert code == 0
+    assert "verdict    good enough to map: no, because of sharpness, texture" in out
+    assert "offset of camera and GNSS not observable" in out
+
+
+def test_check_turns_the_verdict_into_an_exit_code(fleetmap, recording, survey):
+    assert fleetmap("info", recording, "--check")[0] == 1
+    code, out, _ = fleetmap("info", survey.recording, "--check", "--quick")
+    assert code == 0
+    assert "verdict    good enough to map: yes" in out
+
+
+def test_the_judgement_in_json(fleetmap, survey):
+    code, out, _ = fleetmap("info", survey.recording, "--json")
+    document = json.loads(out)
+    assert code == 0
+    assert document["verdict"] in ("yes", "yes, with warnings")
+    assert document["summary"].startswith(document["verdict"])
+    assert {"aspect", "severity", "text", "value"} == set(document["findings"][0])
+    assert {finding["severity"] for finding in document["findings"]} <= {"good", "poor", "bad", "unknown"}
+    assert document["clock_offset_s"] == pytest.approx(0.0, abs=3.0 * document["clock_offset_sigma_s"])
+    assert document["clock_offset_reason"] is None
+    assert document["gnss_quality"]["kind"] == "RTK"
+    assert document["image_quality"]["parallax_px_per_m"] > 2.0
+
+
+def test_quick_leaves_the_images_alone(fleetmap, survey):
+    document = json.loads(fleetmap("info", survey.recording, "--json", "--quick")[1])
+    assert document["image_quality"] is None
+    assert document["clock_offset_s"] is None
+    assert document["clock_offset_reason"] == "the images were not looked at"
+
+
+def test_topics_say_what_they_are_read_for(fleetmap, recording):
+    _, out, _ = fleetmap("info", recording)
+    assert "sensor_msgs/msg/NavSatFix (GNSS fixes, 10.0 Hz)" in out
+    assert "tf2_msgs/msg/TFMessage (transforms)" in out

@@ -71,7 +71,7 @@ class PathModel:
         unknowns[speed] = _speeds_mps(times_s, self.fixes.positions_m, self.speed_knots_s)
         speeds = _hats(self.speed_knots_s, self._middles_s()) @ unknowns[speed]
         steps = speeds * np.exp(1j * self.course.course_rad)
-        path = _real_times_complex(_elapsed_s(self.course.times_s, times_s), steps[:, None]).ravel()
+        path = _integral(self.course.times_s, steps, times_s)
         turn = np.angle(np.vdot(path - path.mean(), points - points.mean()))
         unknowns[correction] = turn
         shift = (points - path * np.exp(1j * turn)).mean()
@@ -89,16 +89,14 @@ class PathModel:
         heading = np.interp(times_s, course.times_s, course.heading_rad) + heading_hats @ unknowns[correction]
         forward = np.exp(1j * heading)
         arm = forward * complex(*unknowns[lever])
-        elapsed_s = _elapsed_s(course.times_s, times_s)
         error = error_hats @ (unknowns[east] + 1j * unknowns[north])
         velocities = speeds * directions
-        way = _real_times_complex(elapsed_s, velocities[:, None]).ravel()
-        residuals = way + arm + error - self.fixes.complex_m
-        now = np.clip(np.searchsorted(course.times_s, times_s) - 1, 0, len(speeds) - 1)
+        residuals = _integral(course.times_s, velocities, times_s) + arm + error - self.fixes.complex_m
+        now = _interval(course.times_s, times_s)
         turn_rate = np.diff(course.heading_rad) / np.diff(course.times_s)
         by_offset = velocities[now] + 1j * turn_rate[now] * arm
-        by_speed = _real_times_complex(elapsed_s, directions[:, None] * speed_hats)
-        by_correction = _real_times_complex(elapsed_s, velocities[:, None] * course_hats)
+        by_speed = _integral(course.times_s, directions[:, None] * speed_hats, times_s)
+        by_correction = _integral(course.times_s, velocities[:, None] * course_hats, times_s)
         by_correction += arm[:, None] * heading_hats
         columns = [by_offset, forward, 1j * forward, by_speed, 1j * by_correction, error_hats, 1j * error_hats]
         jacobian = np.column_stack(columns)
@@ -146,11 +144,6 @@ class PathModel:
         )
 
 
-def _real_times_complex(real: Array, other: Complex) -> Complex:
-    """The product (M, K) of matrices (M, N) and (N, K); numpy's own is slow for mixed kinds."""
-    return np.asarray((real @ np.ascontiguousarray(other).view(np.float64)).view(np.complex128))
-
-
 def _knots(duration_s: float, step_s: float) -> Array:
     return np.linspace(0.0, duration_s, max(2, round(duration_s / step_s) + 1))
 
@@ -161,13 +154,19 @@ def _hats(knots_s: Array, times_s: Array) -> Array:
     return np.asarray(np.clip(1.0 - np.abs(position[:, None] - np.arange(len(knots_s))), 0.0, None))
 
 
-def _elapsed_s(edges_s: Array, times_s: Array) -> Array:
-    """Seconds (M, N - 1) that each interval between edges (N,) has lasted at each time; the outer ones go on."""
-    since = times_s[:, None] - edges_s[None, :-1]
-    overlap = np.clip(since, 0.0, np.diff(edges_s))
-    overlap[:, 0] = np.minimum(since[:, 0], edges_s[1] - edges_s[0])
-    overlap[:, -1] = np.where(since[:, -1] > 0.0, since[:, -1], overlap[:, -1])
-    return np.asarray(overlap)
+def _interval(edges_s: Array, times_s: Array) -> NDArray[np.intp]:
+    """Which of the intervals between edges (N,) each time is in; the outer ones go on."""
+    return np.clip(np.searchsorted(edges_s, times_s) - 1, 0, len(edges_s) - 2)
+
+
+def _integral(edges_s: Array, rates: Complex, times_s: Array) -> Complex:
+    """The integral (M, ...) from the first edge to each time (M,) of rates (N - 1, ...), even in each interval."""
+    now = _interval(edges_s, times_s)
+    steps_s, since_s = np.diff(edges_s), times_s - edges_s[now]
+    if rates.ndim == 2:
+        steps_s, since_s = steps_s[:, None], since_s[:, None]
+    before = np.cumsum(steps_s * rates, axis=0) - steps_s * rates
+    return np.asarray(before[now] + since_s * rates[now])
 
 
 def _slope(knots_s: Array, walk: float) -> Array:

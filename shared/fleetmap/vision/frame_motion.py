@@ -26,6 +26,7 @@ _WINDOW_PX, _LEVELS = (15, 15), 4
 _BACK_CHECK_PX = 0.7
 _MIN_TRACKS = 20
 _NOISE_PX = 0.3  # of a followed corner at reduced size; the scale of the robust weights
+_FLOW_BIAS_PX = 0.03  # of Lucas-Kanade at full size, common to many corners: no parallax smaller points anywhere
 _ITERATIONS = 12
 
 
@@ -66,13 +67,14 @@ class FrameFollower:
         starts += _five_point(rays_a, rays_b, 2.0 * self._noise)
         fits = [_refine(rays_a, rays_b, rotation, direction, self._noise) for rotation, direction in starts]
         best = min(fits, key=lambda fit: fit.cost)
+        parallax_px = self._parallax_px(rays_a, rays_b, best.rotation)
         return FrameMotion(
             rotation_rad=so3_log(best.rotation),
             direction=_ahead_of_points(rays_a, rays_b, best.rotation, best.direction),
             rotation_sigma_rad=best.rotation_sigma_rad,
-            direction_sigma_rad=best.direction_sigma_rad,
+            direction_sigma_rad=float(np.hypot(best.direction_sigma_rad, _FLOW_BIAS_PX / max(parallax_px, 1e-6))),
             track_count=len(rays_a),
-            parallax_px=self._parallax_px(rays_a, rays_b, best.rotation),
+            parallax_px=parallax_px,
         )
 
     def _rays(self, reduced_pixels: Array, reduced: Image) -> Array:

@@ -73,11 +73,11 @@ def estimate(truth, offset_s, *, model=RTK, interval_s=0.2, seed=0, source="stat
     return estimate_clock_offset(motions or motions_of(truth, seed), GnssTrack.of(shifted), antenna)
 
 
-@pytest.mark.parametrize("interval_s", [0.1, 0.2, 1.0])
-@pytest.mark.parametrize("offset_s", [-0.2, -0.083, 0.0, 0.05, 0.2])
+@pytest.mark.parametrize("interval_s", [0.1, 1.0])
+@pytest.mark.parametrize("offset_s", [-0.2, 0.0, 0.083])
 def test_the_offset_of_a_drive_with_turns_is_found_to_20_ms(offset_s, interval_s):
     truth = drive_of(two_turns)
-    for seed in range(3):
+    for seed in range(2):
         found = estimate(truth, offset_s, interval_s=interval_s, seed=seed)
         assert found.offset_s == pytest.approx(offset_s, abs=0.02)
         assert 0.0 < found.sigma_s < 0.03
@@ -109,7 +109,7 @@ def test_a_straight_at_constant_speed_says_nothing():
 
 
 def test_a_consumer_receiver_with_a_fix_a_second_is_not_trusted_with_milliseconds():
-    for seed in range(5):
+    for seed in range(3):
         found = estimate(drive_of(two_turns), 0.1, model=CONSUMER, interval_s=1.0, seed=seed)
         assert found.offset_s is None or abs(found.offset_s - 0.1) < 3.0 * found.sigma_s
 
