@@ -7,7 +7,7 @@ that no step has to look at the whole drive.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -212,14 +212,21 @@ class GrowingMap:
             counts = [(k, count_marked(k.landmark_of, self._marks)) for k in self._holders(landmark_ids)]
         return sorted((c for c in counts if c[1] > 0), key=lambda c: (-c[1], -c[0].index))
 
-    def landmarks_of(self, keyframes: list[Keyframe]) -> Ids:
+    def landmarks_of(self, keyframes: Sequence[Keyframe]) -> Ids:
         """Ids of all living landmarks that the keyframes see."""
         seen = np.concatenate([k.landmark_of for k in keyframes]) if keyframes else np.zeros(0, np.int32)
         ids: Ids = distinct_living(seen, self.alive)
         return ids
 
+    def not_seen_by(self, keyframe: Keyframe, landmarks: Ids) -> Ids:
+        """Those of some landmarks that a keyframe does not see."""
+        seen = keyframe.landmarks()
+        with self._marked(seen):
+            unseen: Ids = landmarks[self._marks[landmarks] == 0]
+        return unseen
+
     def observations_of(self, landmarks: Ids, keyframes: list[Keyframe]) -> list[tuple[NDArray[np.int64], Ids]]:
-        """For every keyframe the features (n,) that show any of the landmarks, and which of the list each shows."""
+        """For every keyframe the features (n,) that show some of the landmarks, and which of them (n,)."""
         with self._marked(landmarks):
             rows = [marked_features(k.landmark_of, self._marks) for k in keyframes]
             return [(r, self._marks[k.landmark_of[r]] - 1) for r, k in zip(rows, keyframes, strict=True)]

@@ -11,6 +11,7 @@ from fleetmap_mapper.adjustment import AdjustmentProblem, adjust
 from fleetmap_mapper.bookkeeping import sorted_by_landmark
 from fleetmap_mapper.growing_map import SCALE_FACTOR, GrowingMap, Ids, Keyframe
 from fleetmap_mapper.settings import MapperSettings
+from fleetmap_mapper.stage_times import StageTimes
 from fleetmap_mapper.tracking import match_landmarks
 from fleetmap_mapper.triangulation import CHI2_2DOF_95, is_consistent, parallax_rad, triangulate
 
@@ -20,14 +21,17 @@ _RECENT_KEYFRAMES = 3  # for how long a young landmark is on probation
 _MIN_FOUND_RATIO = 0.25
 
 
-def extend_map(growing: GrowingMap, keyframe: Keyframe, settings: MapperSettings) -> None:
+def extend_map(growing: GrowingMap, keyframe: Keyframe, settings: MapperSettings, times: StageTimes) -> None:
     """Everything that happens once a keyframe has been added."""
     sweep_young_landmarks(growing, settings.mapping.min_observations)
     neighbours = _neighbours(growing, keyframe, settings.mapping.neighbours)
-    for neighbour in neighbours:
-        triangulate_between(growing, neighbour, keyframe, settings)
-    fuse_with(growing, keyframe, neighbours, settings)
-    adjust_locally(growing, keyframe, settings.mapping.window)
+    with times.stage("triangulating"):
+        for neighbour in neighbours:
+            triangulate_between(growing, neighbour, keyframe, settings)
+    with times.stage("fusing"):
+        fuse_with(growing, keyframe, neighbours, settings)
+    with times.stage("adjusting"):
+        adjust_locally(growing, keyframe, settings.mapping.window)
 
 
 def triangulate_between(growing: GrowingMap, older: Keyframe, newer: Keyframe, settings: MapperSettings) -> None:
@@ -74,7 +78,7 @@ def fuse_with(growing: GrowingMap, keyframe: Keyframe, others: list[Keyframe], s
 def _fuse_into(
     growing: GrowingMap, keyframe: Keyframe, candidates: Ids, radius_px: float, settings: MapperSettings
 ) -> None:
-    new = np.setdiff1d(candidates, keyframe.landmarks()).astype(np.int32)
+    new = growing.not_seen_by(keyframe, candidates)
     landmarks, features = match_landmarks(
         growing, keyframe.features, keyframe.vis_from_cam, new, radius_px, settings.tracking
     )
@@ -178,8 +182,8 @@ def sweep_young_landmarks(growing: GrowingMap, min_observations: int) -> None:
 
 def median_depth(growing: GrowingMap, keyframe: Keyframe) -> float:
     """Median depth of the landmarks a keyframe sees, in vis units."""
-    points = growing.points[keyframe.landmarks()]
-    return float(np.median(keyframe.vis_from_cam.inverse().transform(points)[:, 2])) if len(points) else 0.0
+    rays = growing.points[keyframe.landmarks()] - keyframe.vis_from_cam.translation_m
+    return float(np.median(rays @ keyframe.vis_from_cam.rotation[:, 2])) if len(rays) else 0.0
 
 
 def _neighbours(growing: GrowingMap, keyframe: Keyframe, count: int) -> list[Keyframe]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -23,6 +24,7 @@ from fleetmap_mapper.quality import assess
 from fleetmap_mapper.segments import join_segments
 from fleetmap_mapper.settings import MapperSettings
 from fleetmap_mapper.slam import PosedFrame, Segment, run_slam
+from fleetmap_mapper.stage_times import StageTimes
 
 _log = logging.getLogger(__name__)
 
@@ -47,7 +49,9 @@ def map_drive(drive: Drive, settings: MapperSettings, progress: Progress = lambd
     """
     track = gnss_track(drive.gnss_fixes(), drive.antenna().position_in_cam_m)
     aligner = GnssAligner(track, settings) if settings.gnss.mode == "full" else None
-    segments = run_slam(_counted(drive, progress), drive.camera, settings, aligner)
+    times, start_s = StageTimes(), time.perf_counter()
+    segments = run_slam(_counted(drive, progress), drive.camera, settings, aligner, times)
+    _report_speed(sum(len(s.posed) for s in segments), time.perf_counter() - start_s, times)
 
     progress("placing the map", 0, 1)
     joined, map_from_vis = _placed_segments(segments, track, settings)
@@ -91,6 +95,12 @@ def _counted(drive: Drive, progress: Progress) -> Iterator[Frame]:
     for index, frame in enumerate(drive.frames()):
         progress("tracking", index, drive.frame_count)
         yield frame
+
+
+def _report_speed(images: int, seconds: float, times: StageTimes) -> None:
+    _log.info(
+        "%d images in %.1f s, %.1f images/s before the map is placed: %s", images, seconds, images / seconds, times
+    )
 
 
 def _stamps(posed: list[PosedFrame]) -> NDArray[np.int64]:

@@ -7,7 +7,8 @@ A recorded drive is known whole, so frames before the first map are posed as wel
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Reversible
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,11 +22,14 @@ from fleetmap.vision.features import FeatureExtractor, Features, FeatureSettings
 from fleetmap_mapper.growing_map import GrowingMap, Ids, Keyframe
 from fleetmap_mapper.initialisation import map_from_two_views, match_two_views
 from fleetmap_mapper.local_mapping import adjust_keyframes, extend_map
+from fleetmap_mapper.read_ahead import read_ahead
 from fleetmap_mapper.settings import MapperSettings
+from fleetmap_mapper.stage_times import StageTimes
 from fleetmap_mapper.tracking import Tracked, relocalise, track
 
 _YOUNG_MAP_KEYFRAMES = 5  # losing track of a younger map means that its first two views misled
 _RELOCALISE_AGAINST = 10
+_FRAMES_AHEAD = 8
 
 
 @dataclass(frozen=True)
@@ -63,18 +67,25 @@ class Segment:
     posed: list[PosedFrame]  # in time order
 
 
-OnKeyframe = Callable[[GrowingMap, list[PosedFrame]], None]
+OnKeyframe = Callable[[GrowingMap, Reversible[PosedFrame]], None]  # the posed frames are in time order
 
 
 class Slam:
     """The state of one run; feed it frames in order, then call ``finish``."""
 
-    def __init__(self, camera: Camera, settings: MapperSettings, on_keyframe: OnKeyframe | None = None) -> None:
+    def __init__(
+        self,
+        camera: Camera,
+        settings: MapperSettings,
+        on_keyframe: OnKeyframe | None = None,
+        times: StageTimes | None = None,
+    ) -> None:
         self.growing = GrowingMap(camera)
         self.posed: dict[int, PosedFrame] = {}
         self.lost: list[Unposed] = []  # frames since tracking was lost
         self._settings = settings
         self._on_keyframe = on_keyframe
+        self._times = times or StageTimes()
         self._waiting: list[Unposed] = []
         self._young: list[Unposed] = []  # frames posed in a map that may still prove wrong
         self._first: Unposed | None = None
@@ -92,7 +103,8 @@ class Slam:
         if not self.growing.keyframes:
             self._initialise(frame)
             return
-        tracked = self._track(frame)
+        with self._times.stage("tracking"):
+            tracked = self._track(frame)
         if tracked is None:
             self._waiting.append(frame)
             self.lost.append(frame)
@@ -194,10 +206,11 @@ class Slam:
         landmark_of[tracked.features] = tracked.landmarks
         keyframe = self._add_keyframe(frame, tracked.vis_from_cam, landmark_of)
         self._remember(frame, tracked, keyframe)
-        extend_map(self.growing, keyframe, self._settings)
+        extend_map(self.growing, keyframe, self._settings, self._times)
         self._tracked_at_keyframe = len(tracked.landmarks)
         if self._on_keyframe is not None:
-            self._on_keyframe(self.growing, list(self.posed.values()))
+            with self._times.stage("aligning"):
+                self._on_keyframe(self.growing, self.posed.values())
 
     def _add_keyframe(self, frame: Unposed, vis_from_cam: Pose, landmark_of: Ids) -> Keyframe:
         return self.growing.add_keyframe(
@@ -234,23 +247,23 @@ def run_slam(
     camera: Camera,
     settings: MapperSettings,
     on_keyframe: OnKeyframe | None = None,
+    times: StageTimes | None = None,
 ) -> list[Segment]:
     """Feed a whole drive through SLAM; where tracking is lost for good, a new segment begins.
 
     Raises:
         DriveError: no two images of the drive ever made a map.
     """
-    extractor = FeatureExtractor(camera, FeatureSettings(count=settings.features.count))
-    current, successor = Slam(camera, settings, on_keyframe), None
+    times = times or StageTimes()
+    current, successor = Slam(camera, settings, on_keyframe, times), None
     segments = []
-    for index, frame in enumerate(frames):
-        unposed = Unposed(index, frame.stamp_ns, extractor.extract(frame.image))
+    for unposed in _features_ahead(frames, camera, settings, times):
         current.register_frame(unposed)
         if len(current.lost) < settings.tracking.patience_frames:
             successor = None
             continue
         if successor is None:
-            successor = Slam(camera, settings, on_keyframe)
+            successor = Slam(camera, settings, on_keyframe, times)
             for earlier in current.lost[:-1]:
                 successor.register_frame(earlier)
         successor.register_frame(unposed)
@@ -265,6 +278,34 @@ def run_slam(
             "look at them, and at their exposure"
         )
     return segments
+
+
+def _features_ahead(
+    frames: Iterable[Frame], camera: Camera, settings: MapperSettings, times: StageTimes
+) -> Iterator[Unposed]:
+    """The frames' features in order, found by another thread while earlier frames are being tracked."""
+    coming = read_ahead(_with_features(frames, camera, settings, times), _FRAMES_AHEAD)
+    while True:
+        with times.stage("waiting for features"):
+            unposed = next(coming, None)
+        if unposed is None:
+            return
+        yield unposed
+
+
+def _with_features(
+    frames: Iterable[Frame], camera: Camera, settings: MapperSettings, times: StageTimes
+) -> Iterator[Unposed]:
+    extractor = FeatureExtractor(camera, FeatureSettings(count=settings.features.count))
+    iterator = iter(frames)
+    for index in itertools.count():
+        with times.stage("reading"):
+            frame = next(iterator, None)
+        if frame is None:
+            return
+        with times.stage("finding features"):
+            features = extractor.extract(frame.image)
+        yield Unposed(index, frame.stamp_ns, features)
 
 
 def _none(features: Features) -> Ids:

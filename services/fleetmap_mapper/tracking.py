@@ -18,10 +18,9 @@ from fleetmap.vision.features import Features
 from fleetmap.vision.matching import match_by_projection, match_descriptors
 from fleetmap_mapper.growing_map import SCALE_FACTOR, GrowingMap, Ids, Keyframe
 from fleetmap_mapper.settings import TrackingGroup
+from fleetmap_mapper.visibility import visible_landmarks
 
 Array = NDArray[np.float64]
-_MIN_VIEW_COSINE = 0.5  # a descriptor is not recognised from more than 60 deg off its mean direction
-_MAX_DEPTH_RATIO = 8.0  # distances at which a descriptor is looked for, against where it was seen
 
 
 @dataclass(frozen=True)
@@ -48,7 +47,7 @@ def track(
     fine = _project_and_refine(growing, features, coarse.vis_from_cam, local, settings.refined_radius_px, settings)
     if fine is None or len(fine.landmarks) < settings.min_inliers:
         return None
-    growing.count_sighting(local[_visible(growing, local, fine.vis_from_cam)[0]], fine.landmarks)
+    growing.count_sighting(visible_landmarks(growing, local, fine.vis_from_cam)[0], fine.landmarks)
     return fine
 
 
@@ -89,8 +88,7 @@ def match_landmarks(
     settings: TrackingGroup,
 ) -> tuple[Ids, Ids]:
     """Landmarks and the features that look like them where they should be; both (n,)."""
-    rows, pixels, octaves = _visible(growing, local, vis_from_cam)
-    ids = local[rows]
+    ids, pixels, octaves = visible_landmarks(growing, local, vis_from_cam)
     found = match_by_projection(
         pixels,
         radius_px * SCALE_FACTOR ** octaves.astype(np.float64),
@@ -122,23 +120,3 @@ def _project_and_refine(
     if pose is None:
         return None
     return Tracked(pose.map_from_cam, landmarks[pose.inliers], found[pose.inliers])
-
-
-def _visible(
-    growing: GrowingMap, local: Ids, vis_from_cam: Pose
-) -> tuple[NDArray[np.intp], Array, NDArray[np.int64]]:
-    """Rows of ``local`` that a camera should see, their pixels (n, 2) and the octave to look at (n,)."""
-    points = growing.points[local]
-    pixels = growing.camera.project_ideal(vis_from_cam.inverse().transform(points))
-    rays = vis_from_cam.translation_m - points
-    distances = np.linalg.norm(rays, axis=1)
-    cosines = (rays * growing.normals[local]).sum(axis=1) / distances
-    ratio = growing.distances[local] / distances
-    rows = np.flatnonzero(
-        growing.camera.is_inside(pixels)
-        & (cosines > _MIN_VIEW_COSINE)
-        & (ratio < _MAX_DEPTH_RATIO)
-        & (ratio > 1.0 / _MAX_DEPTH_RATIO)
-    )
-    octaves = growing.octaves[local[rows]] + np.round(np.log(ratio[rows]) / np.log(SCALE_FACTOR)).astype(np.int64)
-    return rows, pixels[rows], octaves

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import logging
 from pathlib import Path
 
 import click
@@ -43,6 +44,7 @@ _UNFIT = 3
     "--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True, help="Of all random draws."
 )
 @click.option("--force", is_flag=True, help="Replace an existing output.")
+@click.option("-v", "--verbose", is_flag=True, help="Say on stderr how fast it went, and where the time went.")
 @click.option("--watch", type=_PATH, metavar="DIR", help="Map and publish every drive dropped into this folder.")
 @click.option(
     "--server", metavar="tcp/HOST:PORT", help=f"With --watch: where to publish.  [default: {DEFAULT_ENDPOINT}]"
@@ -59,6 +61,7 @@ def map_(
     antenna_offset: tuple[float, float, float] | None,
     seed: int,
     force: bool,
+    verbose: bool,
     watch: Path | None,
     server: str | None,
     poll_s: float,
@@ -72,6 +75,8 @@ def map_(
       fleetmap map survey.mcap --output my_map --trajectory survey.tum
       fleetmap map --watch drives --server tcp/127.0.0.1:7447
     """
+    if verbose:
+        logging.getLogger("fleetmap_mapper").setLevel(logging.INFO)
     settings = MapperSettings(seed=seed, gnss=GnssGroup(mode=gnss))
     choice = DriveChoice(image_topic, gnss_topic, antenna_offset)
     if watch is not None:
