@@ -9,7 +9,8 @@ the system is tridiagonal. Landmarks follow their reference keyframe; a vision-o
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Reversible, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,7 @@ from scipy.linalg import solveh_banded
 from fleetmap.errors import InputError
 from fleetmap.geometry import Pose
 from fleetmap_mapper.georeferencing import HUBER_SIGMAS, GnssTrack, georeference, path_at_fixes
-from fleetmap_mapper.growing_map import GrowingMap
+from fleetmap_mapper.growing_map import GrowingMap, Keyframe
 from fleetmap_mapper.local_mapping import adjust_locally
 from fleetmap_mapper.settings import MapperSettings
 from fleetmap_mapper.slam import PosedFrame
@@ -35,37 +36,51 @@ class GnssAligner:
         self._track = track
         self._settings = settings
 
-    def __call__(self, growing: GrowingMap, posed: Sequence[PosedFrame]) -> None:
-        """Align if it is time to."""
-        if len(growing.keyframes) % self._settings.gnss.align_every:
+    def __call__(self, growing: GrowingMap, posed: Reversible[PosedFrame]) -> None:
+        """Align the latest keyframes if it is time to; ``posed`` is in time order."""
+        settings = self._settings
+        if len(growing.keyframes) % settings.gnss.align_every:
             return
-        ordered = sorted(posed, key=lambda p: p.stamp_ns)
-        stamps_ns = np.array([p.stamp_ns for p in ordered], dtype=np.int64)
-        track = _one_fix_per_keyframe(self._track, np.array([k.stamp_ns for k in growing.keyframes]))
-        path = path_at_fixes(stamps_ns, [p.vis_from_cam for p in ordered], track)
+        latest = growing.keyframes[-settings.gnss.align_window :]
+        stamps_ns = np.array([k.stamp_ns for k in latest], dtype=np.int64)
+        track = _one_fix_per_keyframe(self._track, stamps_ns)
+        frames = _frames_since(posed, int(stamps_ns[0]) if latest[0].index else None)
+        frame_stamps_ns = np.array([p.stamp_ns for p in frames], dtype=np.int64)
+        path = path_at_fixes(frame_stamps_ns, [p.vis_from_cam for p in frames], track)
         try:
-            S = georeference(path, track, self._settings.gnss.level_sigma_deg)
+            S = georeference(path, track, settings.gnss.level_sigma_deg)
         except InputError:
             return  # not yet determined; later keyframes will see more
-        keyframe_stamps = np.array([k.stamp_ns for k in growing.keyframes])
         fixes = np.array([p.fix for p in path])
         antennas = np.array([S.transform_pose(p.pose).transform(track.antenna_in_cam_m) for p in path])
         corrections = smooth_corrections(
-            np.array([S.transform(k.vis_from_cam.translation_m) for k in growing.keyframes]),
-            _nearest(keyframe_stamps, track.stamps_ns[fixes]),
+            np.array([S.transform(k.vis_from_cam.translation_m) for k in latest]),
+            _nearest(stamps_ns, track.stamps_ns[fixes]),
             track.positions_m[fixes] - antennas,
             track.covariances_m2[fixes],
+            is_start_free=latest[0].index == 0,
         )
-        _move(growing, corrections @ S.rotation / S.scale)
-        adjust_locally(growing, growing.keyframes[-1], self._settings.mapping.window)
+        _move(growing, latest, corrections @ S.rotation / S.scale)
+        adjust_locally(growing, latest[-1], settings.mapping.window)
+
+
+def _frames_since(posed: Reversible[PosedFrame], stamp_ns: int | None) -> list[PosedFrame]:
+    """The latest of some frames in time order; all of them without a stamp."""
+    latest = list(itertools.takewhile(lambda p: stamp_ns is None or p.stamp_ns >= stamp_ns, reversed(posed)))
+    return latest[::-1]
 
 
 def smooth_corrections(
-    positions_m: Array, at: NDArray[np.int64], residuals_m: Array, covariances_m2: Array
+    positions_m: Array,
+    at: NDArray[np.int64],
+    residuals_m: Array,
+    covariances_m2: Array,
+    is_start_free: bool = True,
 ) -> Array:
     """Corrections (K, 3) of keyframe positions (K, 3) in map that meet the residuals (F, 3) of fixes.
 
-    ``at`` (F,) names the keyframe of each fix.
+    ``at`` (F,) names the keyframe of each fix. Where the start is not free, the first keyframe stays close to its
+    place, as the one before it does not move.
 
     Axis by axis least squares, reweighted for Huber's rho, of fix terms and of differences between neighbours.
     """
@@ -81,6 +96,7 @@ def smooth_corrections(
             banded[1, :-1] += stiffness
             banded[1, 1:] += stiffness
             banded[0, 1:] = -stiffness
+            banded[1, 0] += 0.0 if is_start_free else stiffness[0]
             np.add.at(banded[1], at, weights[:, axis])
             right = np.zeros(len(positions_m))
             np.add.at(right, at, weights[:, axis] * residuals_m[:, axis])
@@ -88,13 +104,14 @@ def smooth_corrections(
     return corrections
 
 
-def _move(growing: GrowingMap, shifts_in_vis: Array) -> None:
-    """Shift keyframes (K, 3), and each landmark with the keyframe that carries it."""
-    for keyframe, shift in zip(growing.keyframes, shifts_in_vis, strict=True):
+def _move(growing: GrowingMap, keyframes: Sequence[Keyframe], shifts_in_vis: Array) -> None:
+    """Shift the latest keyframes (K, 3), and each landmark with the keyframe that carries it."""
+    for keyframe, shift in zip(keyframes, shifts_in_vis, strict=True):
         pose = keyframe.vis_from_cam
         keyframe.vis_from_cam = Pose(pose.rotation, pose.translation_m + shift)
-    count = growing.landmark_count
-    growing.points[:count] += shifts_in_vis[growing.reference[:count]]
+    landmarks = growing.landmarks_of(keyframes)
+    rows = growing.reference[landmarks] - keyframes[0].index
+    growing.points[landmarks[rows >= 0]] += shifts_in_vis[rows[rows >= 0]]
 
 
 def _one_fix_per_keyframe(track: GnssTrack, keyframe_stamps_ns: NDArray[np.int64]) -> GnssTrack:

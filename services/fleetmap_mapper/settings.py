@@ -61,6 +61,7 @@ class GnssGroup(_Group):
 
     mode: GnssMode = "full"
     align_every: int = 5  # keyframes between two light alignments while mapping
+    align_window: int = Field(default=300, ge=10)  # keyframes that such an alignment moves; older ones stay
     level_sigma_deg: float = 0.5  # how level the camera's horizontal axis is taken to be, averaged over a drive
 
 

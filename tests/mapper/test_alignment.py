@@ -12,7 +12,7 @@ from fleetmap.vision.features import Features
 from fleetmap_mapper.alignment import GnssAligner, smooth_corrections
 from fleetmap_mapper.georeferencing import HUBER_SIGMAS, GnssTrack
 from fleetmap_mapper.growing_map import GrowingMap
-from fleetmap_mapper.settings import MapperSettings
+from fleetmap_mapper.settings import GnssGroup, MapperSettings, MappingGroup
 from fleetmap_mapper.slam import PosedFrame
 
 KEYFRAMES, STEP_M = 60, 1.5
@@ -118,8 +118,12 @@ def test_a_car_that_stands_does_not_break_the_system(positions):
 
 @pytest.fixture
 def growing_with_path(make_world):
-    """A map of ten keyframes whose scale is a fifth of the world's, and its keyframes as posed frames."""
     world = make_world(keyframes=10, points=200, step_m=2.0)
+    return world, *growing_along(world)
+
+
+def growing_along(world):
+    """A map whose scale is a fifth of the world's, and its keyframes as posed frames."""
     growing = GrowingMap(world.camera)
     for k, pose in enumerate(world.poses):
         rows = np.flatnonzero(world.keyframe_index == k)
@@ -137,7 +141,7 @@ def growing_with_path(make_world):
     growing.points[:count] = world.points / 5.0
     growing.alive[:count] = True
     growing.merged_into[:count] = np.arange(count)
-    for k in range(10):
+    for k in range(len(world.poses)):
         growing.reference[growing.keyframes[k].landmark_of] = k
     posed = [
         PosedFrame(
@@ -145,7 +149,7 @@ def growing_with_path(make_world):
         )
         for k in growing.keyframes
     ]
-    return world, growing, posed
+    return growing, posed
 
 
 def track_of(positions: np.ndarray, stamps_ns: np.ndarray) -> GnssTrack:
@@ -190,3 +194,32 @@ def test_every_fifth_keyframe_the_map_is_carried_towards_its_fixes(growing_with_
     GnssAligner(track_of(world.centres, np.arange(10) * 10**9), MapperSettings())(growing, posed)
     assert before_m > 0.1
     assert 0.0 < misfit_m() < 0.6 * before_m
+
+
+def test_keyframes_before_the_window_stay_and_the_window_joins_them_smoothly():
+    positions = np.stack([np.arange(20.0), np.zeros(20), np.zeros(20)], axis=1)
+    residuals = np.array([[0.0, 0.2, 0.0]])
+    fix = np.array([19]), residuals, covariances(1, 0.01)
+    free, held = (smooth_corrections(positions, *fix, is_start_free=is_free)[:, 1] for is_free in (True, False))
+    np.testing.assert_allclose(free, 0.2, atol=1e-6)  # nothing holds it back
+    assert 0.0 < held[0] < 0.02
+    assert np.all(np.diff(held) > 0.0)
+    assert 0.1 < held[-1] < 0.2
+
+
+def test_only_the_latest_keyframes_and_their_landmarks_move(make_world):
+    world = make_world(keyframes=40, points=800, step_m=2.0)
+    growing, posed = growing_along(world)
+    centres = np.array([k.vis_from_cam.translation_m for k in growing.keyframes])
+    points = growing.points.copy()
+    bent = world.centres + 0.3 * np.sin(np.arange(40) / 3.0)[:, None] * np.array([0.0, 0.0, 1.0])
+    settings = MapperSettings(gnss=GnssGroup(align_window=10), mapping=MappingGroup(window=4))
+    GnssAligner(track_of(bent, np.arange(40) * 10**9), settings)(growing, posed)
+    moved = np.linalg.norm([k.vis_from_cam.translation_m for k in growing.keyframes] - centres, axis=1)
+    assert np.all(moved[:30] == 0.0)
+    assert np.all(moved[32:] > 0.0)
+    behind = np.setdiff1d(
+        growing.landmarks_of(growing.keyframes[:20]), growing.landmarks_of(growing.keyframes[20:])
+    )
+    assert len(behind) > 20
+    np.testing.assert_array_equal(growing.points[behind], points[behind])
