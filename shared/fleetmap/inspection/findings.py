@@ -29,7 +29,7 @@ _SIGMA_M = (0.5, 15.0)
 _OVERCONFIDENT = 3.0
 _GNSS_GAP_S = 10.0
 _COVERED_SHARE = (0.9, 0.5)
-_JUMP_SHARE = 0.2
+_JUMP_SHARE, _JUMP_M = 0.2, (0.0, 1000.0)
 _EXTENT_M = (30.0, 5.0)
 _STANDING_SHARE = (0.5, 0.95)
 _OFFSET_S = (0.02, 0.5)
@@ -135,7 +135,7 @@ def gnss_jumps(gnss: GnssQuality, fix_count: int) -> Finding:
     """Are there fixes that no vehicle could have reached?"""
     if gnss.jump_count == 0:
         return Finding("GNSS jumps", "good", "none", 0.0)
-    severity = _high(gnss.jump_count / fix_count, (0.0, _JUMP_SHARE))
+    severity = _worse(_high(gnss.jump_count / fix_count, (0.0, _JUMP_SHARE)), _high(gnss.largest_jump_m, _JUMP_M))
     text = f"{gnss.jump_count} of {fix_count} fixes lie up to {gnss.largest_jump_m:.1f} m beside the way"
     return Finding("GNSS jumps", severity, f"{text}; reflections? drive where the sky is open", gnss.jump_count)
 

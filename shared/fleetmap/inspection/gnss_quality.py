@@ -21,7 +21,7 @@ _DENSE_STEP_S = 0.15  # neighbours closer than this differ by noise more than by
 _ACCELERATION_MPS2 = 8.0  # what no car exceeds for long
 _JUMP_SIGMAS = 5.0
 _SPEED_STEP_S = 1.0
-_STANDING_MPS = 0.5
+_STANDING_MPS, _FASTEST_MPS = 0.5, 100.0  # faster is a jump
 
 
 @dataclass(frozen=True)
@@ -36,10 +36,11 @@ class GnssTrack:
     def of(fixes: Sequence[GnssFix]) -> GnssTrack:
         """The track of one fix or more."""
         lat, lon, height = np.array([(fix.lat_deg, fix.lon_deg, fix.height_m) for fix in fixes]).T
-        grid = UtmGrid.at(float(lat[0]), float(lon[0]))
+        somewhere = float(np.median(lat)), float(np.median(lon))  # the first fixes may be wild
+        grid = UtmGrid.at(*somewhere)
         positions = grid.from_geodetic(lat, lon, height)
         positions = positions - positions[0]
-        positions[:, :2] /= grid.point_scale_factor(float(lat[0]), float(lon[0]))
+        positions[:, :2] /= grid.point_scale_factor(*somewhere)
         variances = np.array([np.diag(fix.covariance_enu_m2)[:2].mean() for fix in fixes])
         stamps_ns = np.array([fix.stamp_ns for fix in fixes], dtype=np.int64)
         return GnssTrack(stamps_ns, positions, np.sqrt(variances))
@@ -84,7 +85,7 @@ def measure_gnss(track: GnssTrack, image_stamps_ns: Stamps) -> GnssQuality:
     sigma_m = float(np.median(track.sigmas_m))
     jumps_m = _jumps_m(track)
     speeds = _speeds_mps(track)
-    moving = speeds[speeds > _STANDING_MPS]
+    moving = speeds[(speeds > _STANDING_MPS) & (speeds < _FASTEST_MPS)]
     return GnssQuality(
         kind=_kind(sigma_m),
         reported_sigma_m=sigma_m,

@@ -22,7 +22,7 @@ from fleetmap.inspection.sampling import pairs_to_follow
 Verdict = Literal["yes", "yes, with warnings", "no"]
 Progress = Callable[[str, int, int], None]
 
-_MIN_FIXES = 3
+_IMAGE_FAULTS = {"readable images", "calibration for the images' size", "images in time order"}
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def judge_drive(
         try:
             images, offset = _look_at_images(contents, track, progress)
         except InputError as error:
-            if not found:
+            if not _IMAGE_FAULTS & {finding.aspect for finding in found}:
                 found.append(Finding("readable images", "bad", str(error)))
     found += _findings(contents, gnss, images, offset)
     verdict, summary = _verdict(found)
