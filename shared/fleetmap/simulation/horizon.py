@@ -31,8 +31,8 @@ def raise_horizon(
     paints: list[int] = []
     for side, (far, near) in enumerate(itertools.pairwise(ring)):  # from inside, counter-clockwise is leftwards
         if pictures is None or side < pictures:
-            picture = textures.paint_horizon(rng, width, height, SKY_GREY, seamless=pictures is not None)
-            paints.append(builder.add_texture(picture))
+            grey, opacity = textures.paint_horizon(rng, width, height, SKY_GREY, seamless=pictures is not None)
+            paints.append(builder.add_texture(grey, opacity))
         foot, top = [0.0, 0.0, foot_m], [0.0, 0.0, height + foot_m]
         corners = np.stack([near + top, far + top, far + foot, near + foot])
         builder.add_quad(corners, paints[side % len(paints)], lit=False)

@@ -343,14 +343,16 @@ def paint_sign(rng: Rng, width_m: float, height_m: float) -> GreyImage:
 
 def paint_horizon(
     rng: Rng, width_m: float, height_m: float, sky_grey: float, *, seamless: bool = False
-) -> GreyImage:
-    """Far roofs, trees and hills below the sky; the top row is sky. 400 rows, however far and high they are.
+) -> tuple[GreyImage, GreyImage]:
+    """Far roofs, trees and hills, and their opacity (H, W): the sky above them is the world's own.
 
-    ``seamless``: every ridge meets that of any other picture beside it.
+    400 rows, however far and high they are; the top row is sky. ``seamless``: every ridge meets that of any other
+    picture beside it.
     """
     scene = Canvas(rng, width_m, height_m, 400.0 / height_m, sky_grey)
     rows, columns = scene.grey.shape
     x = np.arange(columns)
+    solid = np.zeros((rows, columns), dtype=bool)
     for layer, (top, grey) in enumerate(((0.32, 190.0), (0.25, 160.0), (0.19, 115.0))):
         ridge = fractal_noise(rng, (64, columns), columns / 2.0, 0.4 + 0.08 * layer)[32]
         if seamless:
@@ -361,4 +363,6 @@ def paint_horizon(
         below = np.arange(rows)[:, None] >= rows - heights[x]
         texture = grey + (6.0 + 11.0 * layer) * fractal_noise(rng, (rows, columns), 32.0, 0.9)
         scene.grey[below] = texture[below]
-    return np.asarray(cv2.GaussianBlur(scene.finish(), (0, 0), 0.8), dtype=np.uint8)
+        solid |= below
+    softened = np.asarray(cv2.GaussianBlur(scene.finish(), (0, 0), 0.8), dtype=np.uint8)
+    return softened, np.asarray(solid, dtype=np.uint8) * np.uint8(255)

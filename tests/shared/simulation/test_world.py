@@ -166,13 +166,13 @@ _DRAWINGS = ((render, (CLEAN,)), (render_depth, ()))
 
 
 def test_open_places_are_wider_than_streets() -> None:
-    """Half of what one sees there is further away than in a city."""
-    medians = {}
+    """Half as much again of a level view is far away or sky."""
+    far = {}
     for kind in ("open", "city"):
         world = _world(kind)
         depths = [render_depth(world.scene, CAMERA, _looking_ahead(world, s)) for s in (5.0, 45.0, 80.0, 120.0)]
-        medians[kind] = np.median([np.median(depth[np.isfinite(depth)]) for depth in depths])
-    assert medians["open"] > 1.5 * medians["city"]
+        far[kind] = np.mean(np.stack(depths) > 30.0)
+    assert 0.9 > far["open"] > 1.5 * far["city"] > 0.1
 
 
 def test_long_worlds_stay_small() -> None:
