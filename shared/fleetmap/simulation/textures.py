@@ -339,30 +339,3 @@ def paint_sign(rng: Rng, width_m: float, height_m: float) -> GreyImage:
     sign.rectangle(0.04, 0.04, width_m - 0.04, height_m - 0.04, float(rng.choice([60.0, 190.0])), 3.0)
     sign.text(0.1 * width_m, 0.65 * height_m, 0.32 * height_m, 245.0 - 180.0 * float(rng.random() < 0.5), 4)
     return sign.finish()
-
-
-def paint_horizon(
-    rng: Rng, width_m: float, height_m: float, sky_grey: float, *, seamless: bool = False
-) -> tuple[GreyImage, GreyImage]:
-    """Far roofs, trees and hills, and their opacity (H, W): the sky above them is the world's own.
-
-    400 rows, however far and high they are; the top row is sky. ``seamless``: every ridge meets that of any other
-    picture beside it.
-    """
-    scene = Canvas(rng, width_m, height_m, 400.0 / height_m, sky_grey)
-    rows, columns = scene.grey.shape
-    x = np.arange(columns)
-    solid = np.zeros((rows, columns), dtype=bool)
-    for layer, (top, grey) in enumerate(((0.32, 190.0), (0.25, 160.0), (0.19, 115.0))):
-        ridge = fractal_noise(rng, (64, columns), columns / 2.0, 0.4 + 0.08 * layer)[32]
-        if seamless:
-            ridge = ridge * np.minimum(np.minimum(x, x[::-1]) / (0.15 * columns), 1.0)
-        heights = np.clip(rows * (top + 0.05 * ridge), 4, 0.9 * rows)
-        if layer == 2:  # houses: steps instead of hills
-            heights = np.repeat(heights[::40], 40)[:columns]
-        below = np.arange(rows)[:, None] >= rows - heights[x]
-        texture = grey + (6.0 + 11.0 * layer) * fractal_noise(rng, (rows, columns), 32.0, 0.9)
-        scene.grey[below] = texture[below]
-        solid |= below
-    softened = np.asarray(cv2.GaussianBlur(scene.finish(), (0, 0), 0.8), dtype=np.uint8)
-    return softened, np.asarray(solid, dtype=np.uint8) * np.uint8(255)
