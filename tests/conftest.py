@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterable
@@ -26,6 +27,9 @@ from fleetmap.trajectory import Trajectory
 from fleetmap_cli.main import main
 
 FLEETMAP = [sys.executable, "-c", "from fleetmap_cli.main import main; main()"]
+
+# A shell lets its background jobs ignore Ctrl-C, and children inherit that: the tests of it would test nothing.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")
