@@ -55,21 +55,30 @@ def adjust(problem: AdjustmentProblem, iterations: int = 10) -> Adjusted:
     # What starts behind its camera takes no part: a step that brought it to the front would look like progress.
     weights = np.where(np.isfinite(at_start), 1.0 / problem.sigmas_px, 0.0)
     starts = np.searchsorted(problem.point_index, np.arange(len(problem.points) + 1)).astype(np.int64)
+    slots = np.where(problem.fixed, -1, np.cumsum(~problem.fixed) - 1)  # place among the free poses
     rotations, translations, points, cost = _levenberg_marquardt(
         _intrinsics(problem.camera),
         np.ascontiguousarray(problem.rotations, dtype=np.float64),
         np.ascontiguousarray(problem.translations, dtype=np.float64),
-        np.ascontiguousarray(problem.fixed),
+        slots,
         np.ascontiguousarray(problem.points, dtype=np.float64),
         np.ascontiguousarray(problem.keyframe_index, dtype=np.int64),
         starts,
         np.ascontiguousarray(problem.pixels, dtype=np.float64),
         weights,
+        _empty_blocks(len(problem.pixels), len(problem.points), int(np.count_nonzero(slots >= 0))),
         iterations,
     )
     rotations = nearest_rotations(rotations)
     chi2 = squared_errors(problem, rotations, translations, points)
     return Adjusted(rotations, translations, points, chi2, cost)
+
+
+def _empty_blocks(observations: int, points: int, poses: int) -> tuple[Array, ...]:
+    """Room for J^T J and the gradients: poses U, gp; points V, gl; mixed W, transposed."""
+    U, gp = np.zeros((poses, 6, 6)), np.zeros((poses, 6))
+    V, gl = np.zeros((points, 3, 3)), np.zeros((points, 3))
+    return U, gp, V, gl, np.empty((observations, 3, 6))
 
 
 def squared_errors(problem: AdjustmentProblem, rotations: Array, translations: Array, points: Array) -> Array:
@@ -112,17 +121,10 @@ def _squared_errors(intrinsics, rotations, translations, points, keyframe_index,
 
 @njit(cache=True, nogil=True)
 def _levenberg_marquardt(  # type: ignore[no-untyped-def]
-    intrinsics, rotations, translations, fixed, points, keyframe_index, starts, pixels, weights, iterations
+    intrinsics, rotations, translations, slots, points, keyframe_index, starts, pixels, weights, blocks, iterations
 ):
-    slots = np.full(len(fixed), -1, np.int64)  # place of each free pose in the reduced system
-    free = 0
-    for k in range(len(fixed)):
-        if not fixed[k]:
-            slots[k] = free
-            free += 1
     damping = 1e-4
     cost = _cost(intrinsics, rotations, translations, points, keyframe_index, starts, pixels, weights)
-    blocks = _empty_blocks(len(keyframe_index), len(points), free)
     for _ in range(iterations):
         _fill_normal_equations(
             blocks, intrinsics, rotations, translations, points, keyframe_index, starts, pixels, weights, slots
@@ -168,14 +170,6 @@ def _cost(intrinsics, rotations, translations, points, keyframe_index, starts, p
             error = np.sqrt(du * du + dv * dv)
             total += 0.5 * error * error if error <= HUBER_PX else HUBER_PX * (error - 0.5 * HUBER_PX)
     return total
-
-
-@njit(cache=True, nogil=True)
-def _empty_blocks(observations, points, poses):  # type: ignore[no-untyped-def]
-    """Of J^T W J and the gradients: poses U, gp; points V, gl; mixed W, transposed."""
-    U, gp = np.zeros((poses, 6, 6)), np.zeros((poses, 6))
-    V, gl = np.zeros((points, 3, 3)), np.zeros((points, 3))
-    return U, gp, V, gl, np.empty((observations, 3, 6))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

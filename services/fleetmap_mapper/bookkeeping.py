@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 
 @njit(cache=True, nogil=True)
@@ -32,9 +33,15 @@ def marked_features(landmark_of, marks):  # type: ignore[no-untyped-def]
     return features[:count].copy()
 
 
+def distinct_living(landmark_of: NDArray[np.int32], alive: NDArray[np.bool_]) -> NDArray[np.int32]:
+    """Sorted ids (n,) of the living landmarks among these, each once; -1 is skipped."""
+    lowest, is_seen = _seen_and_living(landmark_of, alive)
+    ids: NDArray[np.int32] = (np.flatnonzero(is_seen) + lowest).astype(np.int32)
+    return ids
+
+
 @njit(cache=True, nogil=True)
-def distinct_living(landmark_of, alive):  # type: ignore[no-untyped-def]
-    """Sorted ids (n,) int32 of the living landmarks among these, each once; -1 is skipped."""
+def _seen_and_living(landmark_of, alive):  # type: ignore[no-untyped-def]
     lowest, highest = len(alive), -1
     for landmark in landmark_of:
         if landmark >= 0:
@@ -43,7 +50,7 @@ def distinct_living(landmark_of, alive):  # type: ignore[no-untyped-def]
     for landmark in landmark_of:
         if landmark >= 0 and alive[landmark]:
             is_seen[landmark - lowest] = True
-    return (np.flatnonzero(is_seen) + lowest).astype(np.int32)
+    return lowest, is_seen
 
 
 @njit(cache=True, nogil=True)
@@ -87,24 +94,28 @@ def follow_fusions(landmark_of, marks, successors, observations):  # type: ignor
         is_held[place] = True
 
 
-@njit(cache=True, nogil=True)
-def sorted_by_landmark(places, count):  # type: ignore[no-untyped-def]
+def sorted_by_landmark(
+    places: NDArray[np.int32], count: int
+) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.int64]]:
     """Observations of landmarks 0 .. count - 1, sorted by landmark, without those of landmarks seen once.
 
-    Returns their order (m,), the landmark of each renumbered (m,) int32, and the landmarks that are left (n,).
+    Returns their order (m,), the landmark of each renumbered (m,), and the landmarks that are left (n,).
     """
-    seen = np.zeros(count, np.int64)
-    for place in places:
-        seen[place] += 1
+    seen = np.bincount(places, minlength=count)
     kept = np.flatnonzero(seen >= 2)
-    row, next_slot = np.full(count, -1, np.int32), np.zeros(count, np.int64)
-    total = 0
-    for n, place in enumerate(kept):
-        row[place], next_slot[place] = n, total
-        total += seen[place]
-    order, rows = np.empty(total, np.int64), np.empty(total, np.int32)
+    row = np.full(count, -1, np.int32)
+    row[kept] = np.arange(len(kept))
+    next_slot = np.zeros(count, np.int64)
+    next_slot[kept[1:]] = np.cumsum(seen[kept])[:-1]
+    order = _sorted_by_place(places, row, next_slot, int(seen[kept].sum()))
+    return order, row[places[order]], kept
+
+
+@njit(cache=True, nogil=True)
+def _sorted_by_place(places, row, next_slot, total):  # type: ignore[no-untyped-def]
+    order = np.empty(total, np.int64)
     for observation, place in enumerate(places):
         if row[place] >= 0:
-            order[next_slot[place]], rows[next_slot[place]] = observation, row[place]
+            order[next_slot[place]] = observation
             next_slot[place] += 1
-    return order, rows, kept
+    return order

@@ -143,8 +143,7 @@ class GrowingMap:
         """The living landmarks on that list, each once; it is empty afterwards."""
         touched = np.concatenate(self._touched) if self._touched else np.zeros(0, np.int32)
         self._touched = []
-        ids: Ids = distinct_living(touched, self.alive)
-        return ids
+        return distinct_living(touched, self.alive)
 
     def refresh(self, ids: Ids, observers: list[Keyframe]) -> None:
         """Renew what is derived from the observations of some landmarks: normal, descriptor, octave, distance."""
@@ -215,8 +214,7 @@ class GrowingMap:
     def landmarks_of(self, keyframes: Sequence[Keyframe]) -> Ids:
         """Ids of all living landmarks that the keyframes see."""
         seen = np.concatenate([k.landmark_of for k in keyframes]) if keyframes else np.zeros(0, np.int32)
-        ids: Ids = distinct_living(seen, self.alive)
-        return ids
+        return distinct_living(seen, self.alive)
 
     def not_seen_by(self, keyframe: Keyframe, landmarks: Ids) -> Ids:
         """Those of some landmarks that a keyframe does not see."""

@@ -112,26 +112,29 @@ def _match_along_lines(pixels_a, words_a, chosen_a, pixels_b, words_b, reach_b, 
 
 @njit(cache=True, nogil=True)
 def _pencil(epipole, pixels):  # type: ignore[no-untyped-def]
-    """The middle of the pixels, the axes (2, 2) that angles are taken in, and whether the epipole is far away.
+    """The middle of the pixels, the two axes that angles are taken in, and whether the epipole is far away.
 
     Far away, the axes lie along and across the line to the middle; the second grows with the distance, so that
     the lines that cross the image always fill the sectors.
     """
-    low = np.array([pixels[:, 0].min(), pixels[:, 1].min()])
-    high = np.array([pixels[:, 0].max(), pixels[:, 1].max()])
-    middle, size = 0.5 * (low + high), max(0.5 * np.sqrt(((high - low) ** 2).sum()), 1.0)
-    dx, dy = middle - epipole
+    left, right, top, bottom = np.inf, -np.inf, np.inf, -np.inf
+    for j in range(len(pixels)):
+        left, right = min(left, pixels[j, 0]), max(right, pixels[j, 0])
+        top, bottom = min(top, pixels[j, 1]), max(bottom, pixels[j, 1])
+    size = max(0.5 * np.sqrt((right - left) ** 2 + (bottom - top) ** 2), 1.0)
+    middle = (0.5 * (left + right), 0.5 * (top + bottom))
+    dx, dy = middle[0] - epipole[0], middle[1] - epipole[1]
     distance = np.sqrt(dx * dx + dy * dy)
     if not distance > 2.0 * size:
-        return middle, np.eye(2), False
-    stretch = distance / size
-    return middle, np.array([[dx, dy], [-stretch * dy, stretch * dx]]) / distance, True
+        return middle, ((1.0, 0.0), (0.0, 1.0)), False
+    dx, dy, stretch = dx / distance, dy / distance, distance / size
+    return middle, ((dx, dy), (-stretch * dy, stretch * dx)), True
 
 
 @njit(cache=True, nogil=True)
 def _sector(axes, dx, dy):  # type: ignore[no-untyped-def]
     """Where a line of this direction falls in [0, _SECTORS]; grows with its angle, without trigonometry."""
-    along, across = axes[0, 0] * dx + axes[0, 1] * dy, axes[1, 0] * dx + axes[1, 1] * dy
+    along, across = axes[0][0] * dx + axes[0][1] * dy, axes[1][0] * dx + axes[1][1] * dy
     if along < 0.0:
         along, across = -along, -across
     total = along + abs(across)
