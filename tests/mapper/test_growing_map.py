@@ -112,6 +112,25 @@ def test_covisible_keyframes_come_most_shared_first(growing):
     assert growing.covisible(np.array([], np.int32)) == []
 
 
+def test_keyframes_out_of_sight_are_not_looked_at():
+    """What a keyframe costs must not grow with the length of the drive."""
+    growing = GrowingMap(CAMERA)
+    add_keyframe(growing)
+    for _ in range(200):
+        older, newer = growing.keyframes[-1], add_keyframe(growing)
+        add_landmarks(growing, older, newer, 10)
+    growing.take_touched()
+    for keyframe in growing.keyframes[:190]:
+        keyframe.landmark_of = None
+    recent = growing.landmarks_of(growing.keyframes[-3:])
+    assert recent.tolist() == list(range(1970, 2000))
+    assert [k.index for k, _ in growing.covisible(recent)] == [199, 198, 200, 197]
+    growing.merge(recent[20:22], recent[10:12])
+    growing.kill(recent[:5])
+    growing.refresh(recent[5:], growing.keyframes[-4:])
+    assert growing.take_touched().tolist() == recent[10:12].tolist()
+
+
 @given(st.lists(st.integers(1, 900), min_size=1, max_size=5))
 def test_room_grows_without_losing_anything(sizes):
     growing = GrowingMap(CAMERA)

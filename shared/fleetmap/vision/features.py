@@ -13,6 +13,7 @@ from functools import cached_property
 
 import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from fleetmap.camera import Camera
@@ -164,11 +165,21 @@ def _spread(pixels: Array, responses: Array, quota: int, camera: Camera) -> IntA
     cell_px = np.sqrt(camera.width_px * camera.height_px * _FEATURES_PER_CELL / quota)
     columns = int(camera.width_px // cell_px) + 1
     cells = (pixels[:, 1] // cell_px).astype(np.int64) * columns + (pixels[:, 0] // cell_px).astype(np.int64)
-    order = np.lexsort((-responses, cells))
-    starts = np.searchsorted(cells[order], cells[order], side="left")
-    rank_in_cell = np.empty(len(order), dtype=np.int64)
-    rank_in_cell[order] = np.arange(len(order)) - starts
-    return np.asarray(np.lexsort((-responses, rank_in_cell))[:quota])
+    strongest_first = np.argsort(-responses, kind="stable")
+    rank_in_cell = np.empty(len(cells), dtype=np.int64)
+    rank_in_cell[strongest_first] = _count_before(cells[strongest_first], int(cells.max()) + 1)
+    by_rank = np.argsort(rank_in_cell[strongest_first], kind="stable")
+    return np.asarray(strongest_first[by_rank[:quota]])
+
+
+@njit(cache=True, nogil=True)
+def _count_before(cells, cell_count):  # type: ignore[no-untyped-def]
+    """How often each cell of the list occurs before that place in it."""
+    seen, before = np.zeros(cell_count, np.int64), np.empty(len(cells), np.int64)
+    for n, cell in enumerate(cells):
+        before[n] = seen[cell]
+        seen[cell] += 1
+    return before
 
 
 def _no_features(scale_factor: float) -> Features:
