@@ -88,7 +88,7 @@ def test_a_constant_grey_street_is_not_good_enough_to_map(fleetmap, recording):
     code, out, _ = fleetmap("info", recording)
     assert code == 0
     assert "verdict    good enough to map: no, because of sharpness, texture" in out
-    assert "offset of camera and GNSS not observable" in out
+    assert "offset of camera and GNSS unobservable" in out
 
 
 def test_check_turns_the_verdict_into_an_exit_code(fleetmap, recording, survey):

@@ -184,7 +184,7 @@ def antenna_place(antenna: Antenna) -> Finding:
 def clocks(offset: ClockOffset, gnss: GnssQuality) -> Finding:
     """Do camera and receiver read the same time at the same instant?"""
     if offset.offset_s is None or offset.sigma_s is None:
-        return Finding("clocks", "unknown", f"offset of camera and GNSS not observable: {offset.reason}")
+        return Finding("clocks", "unknown", f"offset of camera and GNSS unobservable: {offset.reason}")
     found = f"{abs(offset.offset_s):.3f} +- {offset.sigma_s:.3f} s"
     if abs(offset.offset_s) <= max(_OFFSET_S[0], _OFFSET_SIGMAS * offset.sigma_s):
         return Finding("clocks", "good", f"camera and GNSS agree to {found}", offset.offset_s)
