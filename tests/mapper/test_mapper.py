@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -73,8 +75,11 @@ def test_its_quality_record_is_true(survey, survey_drive, mapped):
     assert quality.warnings == ()
 
 
-def test_the_same_drive_and_settings_give_the_same_map_bit_by_bit(survey_drive, mapped_quickly):
-    again = map_drive(survey_drive, QUICK)
+def test_the_same_drive_and_settings_give_the_same_map_bit_by_bit(survey_drive, mapped_quickly, caplog):
+    with caplog.at_level(logging.INFO, "fleetmap_mapper"):
+        again = map_drive(survey_drive, QUICK)
+    told = r"76 images in \d+\.\d s, \d+\.\d images/s before the map is placed: reading .*, tracking \d+\.\d s, "
+    assert re.match(told, caplog.messages[0])
     np.testing.assert_array_equal(again.trajectory.positions_m, mapped_quickly.trajectory.positions_m)
     np.testing.assert_array_equal(again.trajectory.rotations, mapped_quickly.trajectory.rotations)
     for name in ("points_m", "descriptors", "normals", "octaves", "distances_m"):
