@@ -129,15 +129,7 @@ def build_world(
     if kind == "street":
         street = build_street(seed, length_m, lat_deg=lat_deg, lon_deg=lon_deg, height_m=height_m)
         return World(street.anchor, street.path, street.length_m, False, Scene(street.surfaces, street.atlas))
-    if not SHORTEST_CIRCUIT_M <= length_m <= LONGEST_M:
-        raise InputError(
-            f"a world of {length_m} m cannot be built; give {SHORTEST_CIRCUIT_M:.0f} to {LONGEST_M:.0f} m"
-        )
-    if not (0.0 <= parked_cars_changed <= 1.0 and 0.0 <= moving_cars_per_km <= MOST_CARS_PER_KM):
-        raise InputError(
-            f"{parked_cars_changed} is no share of the parked cars, or {moving_cars_per_km} moving cars per km"
-            f" do not fit; give 0 to 1, and 0 to {MOST_CARS_PER_KM:.0f}"
-        )
+    _require_sense(length_m, parked_cars_changed, moving_cars_per_km)
     anchor = anchor_at(lat_deg, lon_deg, height_m)
     plan_rng, far_rng = np.random.default_rng(seed).spawn(2)
     drive_rng = np.random.default_rng([seed, drive_seed])
@@ -162,6 +154,18 @@ def build_world(
     scene = Scene(builder.surfaces(), build_atlas(builder.textures))
     path = plot.path
     return World(anchor, path, path.length_m, path.is_closed, scene, markers, plot.tunnels_m, moving)
+
+
+def _require_sense(length_m: float, parked_cars_changed: float, moving_cars_per_km: float) -> None:
+    if not SHORTEST_CIRCUIT_M <= length_m <= LONGEST_M:
+        raise InputError(
+            f"a world of {length_m} m cannot be built; give {SHORTEST_CIRCUIT_M:.0f} to {LONGEST_M:.0f} m"
+        )
+    if not (0.0 <= parked_cars_changed <= 1.0 and 0.0 <= moving_cars_per_km <= MOST_CARS_PER_KM):
+        raise InputError(
+            f"{parked_cars_changed} is no share of the parked cars, or {moving_cars_per_km} moving cars per km"
+            f" do not fit; give 0 to 1, and 0 to {MOST_CARS_PER_KM:.0f}"
+        )
 
 
 def _towards_sun(rng: Rng, sun_deg: tuple[float, float] | None) -> Array:
