@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import TypeVar
+from typing import TypeVar, cast
 
 T = TypeVar("T")
 
@@ -21,7 +21,7 @@ def read_ahead(items: Iterable[T], depth: int) -> Iterator[T]:
         try:
             while (item := coming.popleft().result()) is not end:
                 coming.append(worker.submit(next, iterator, end))
-                yield item  # type: ignore[misc]
+                yield cast(T, item)
         finally:
             for future in coming:
                 future.cancel()

@@ -16,6 +16,9 @@ from fleetmap.errors import InputError
 
 Array = NDArray[np.float64]
 
+# A level camera that looks forward: body x forward, y left, z up; cam x right, y down, z forward.
+CAM_FROM_BODY = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+
 
 @dataclass(frozen=True)
 class Pose:

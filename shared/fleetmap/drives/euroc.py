@@ -98,7 +98,7 @@ def convert_euroc(
         info_topic=f"/{frame_id}/camera_info",
         imu_topic=f"/{_IMU}/data",
     ) as writer:
-        _writebody_from_sensor(writer, sensors, frame_id)
+        _write_mounting(writer, sensors, frame_id)
         gnss_frame_id = mount_antenna(writer, frame_id, gnss.antenna_in_camera_m if gnss else None)
         write_in_time_order(
             image_messages(writer, images, sensors.camera, progress),
@@ -151,7 +151,7 @@ def _find_truth(root: Path) -> Path | None:
     return next((table for name in _TRUTHS if (table := find_table(root / name)) is not None), None)
 
 
-def _writebody_from_sensor(writer: DriveWriter, sensors: _Sensors, camera_frame_id: str) -> None:
+def _write_mounting(writer: DriveWriter, sensors: _Sensors, camera_frame_id: str) -> None:
     if sensors.body_from_cam is not None:
         writer.write_static_transform(_BODY, camera_frame_id, sensors.body_from_cam)
     if sensors.body_from_imu is not None:

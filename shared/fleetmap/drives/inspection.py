@@ -93,15 +93,6 @@ class DriveContents:
     antenna: Antenna | None  # None without images or fixes
 
 
-def inspect_drive(path: Path, *, image_topic: str | None = None, gnss_topic: str | None = None) -> DriveInfo:
-    """What a recording holds, and what it lacks.
-
-    Raises:
-        DriveError: it cannot be read at all, or a topic that was asked for is not there.
-    """
-    return look_through(path, image_topic=image_topic, gnss_topic=gnss_topic).info
-
-
 def look_through(path: Path, *, image_topic: str | None = None, gnss_topic: str | None = None) -> DriveContents:
     """Look through a recording; what it lacks is listed, not raised.
 
@@ -172,7 +163,7 @@ def _look_at_images(
     if camera is not None and width is not None and (width, height) != (camera.width_px, camera.height_px):
         missing.append(
             f"calibration for the images' size: they have {width}x{height} pixels,"
-            f" the CameraInfo says {camera.width_px}x{camera.height_px}"
+            f" their calibration says {camera.width_px}x{camera.height_px}"
         )
     steps_ns = np.diff(stamps_ns)
     if np.any(steps_ns <= 0):

@@ -27,11 +27,9 @@ from fleetmap.drives.topic_choice import (
 )
 from fleetmap.drives.topic_reading import first_value, read_values
 from fleetmap.errors import CalibrationError, DriveError
+from fleetmap.geometry import CAM_FROM_BODY
 
 _log = logging.getLogger(__name__)
-
-# A level camera that looks forward: body x forward, y left, z up; cam x right, y down, z forward.
-CAM_FROM_BODY = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 
 
 class McapDrive:

@@ -132,7 +132,7 @@ def _check_start(path: Path, file: IO[bytes]) -> None:
     if not start:
         raise DriveError(f"recording {path} is empty (0 bytes); record or convert it again")
     if start != MAGIC[: len(start)]:
-        raise DriveError(f"{path} is not an MCAP file; fleetmap reads MCAP recordings with ROS 2 messages")
+        raise DriveError(f"{path} is not an MCAP file; fleetmap reads MCAP recordings")
 
 
 def _losses(index: McapIndex) -> list[str]:

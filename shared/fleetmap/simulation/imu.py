@@ -62,7 +62,6 @@ class ImuErrorModel:
     accelerometer: TriadErrorModel
 
 
-PERFECT_IMU = ImuErrorModel(TriadErrorModel(0, 0, 0, 0, 0), TriadErrorModel(0, 0, 0, 0, 0))
 IMU_ERROR_MODELS = {
     "consumer": ImuErrorModel(
         TriadErrorModel(float(np.radians(0.007)), 1.9393e-5, float(np.radians(1.5)), 0.015, 0.01),

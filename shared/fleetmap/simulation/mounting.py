@@ -10,12 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fleetmap.geometry import Pose
+from fleetmap.geometry import CAM_FROM_BODY, Pose
 
 CAMERA_FRAME, ANTENNA_FRAME, IMU_FRAME = "camera", "gnss", "imu"
 VEHICLE_FRAME, LIDAR_FRAME = "base_link", "laser"
 
-_CAM_FROM_VEHICLE_AXES = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 _REAR_AXLE_BEHIND_M = 1.3
 _BUMPER_AHEAD_M, _BUMPER_HEIGHT_M = 2.1, 0.5
 _IMU_IN_CAM_M = (0.12, 0.55, -0.4)  # on the middle console
@@ -50,4 +49,4 @@ class Mounting:
 
 
 def _at(right_m: float, down_m: float, forward_m: float) -> Pose:
-    return Pose(_CAM_FROM_VEHICLE_AXES, np.array([right_m, down_m, forward_m]))
+    return Pose(CAM_FROM_BODY, np.array([right_m, down_m, forward_m]))

@@ -30,9 +30,6 @@ class WheelErrorModel:
     step_mps: float = 0.01 / 3.6
 
 
-PERFECT_WHEELS = WheelErrorModel(0.0, 0.0, 0.0)
-
-
 def wheel_speeds(
     motion: Motion,
     cam_from_vehicle: Pose,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fleetmap.drive import GnssFix
-from fleetmap.drives.inspection import inspect_drive
+from fleetmap.drives.inspection import look_through
 from fleetmap.drives.ros2_writer import DriveWriter
 from fleetmap.errors import DriveError
 from fleetmap.geodesy import UtmGrid
@@ -16,7 +16,7 @@ FRAME_NS = 100_000_000
 
 
 def test_a_complete_recording_lacks_nothing(street, small_camera):
-    found = inspect_drive(street())
+    found = look_through(street()).info
     assert found.missing == ()
     assert {(t.name, t.message_type, t.message_count) for t in found.topics} == {
         ("/front/image/compressed", "sensor_msgs/msg/CompressedImage", 10),
@@ -52,7 +52,7 @@ def test_the_length_of_a_noisy_drive_is_the_way_driven(tmp_path, small_camera, p
         for index in range(2001):
             fix = GnssFix(T0_NS + index * FRAME_NS, lat[index], lon[index], height[index], np.eye(3) * 0.0025)
             writer.write_fix(fix, "camera")
-    found = inspect_drive(tmp_path / "circle.mcap")
+    found = look_through(tmp_path / "circle.mcap").info
     assert found.gnss is not None
     assert found.gnss.length_m == pytest.approx(500.0 / 0.99962, rel=0.005)
 
@@ -64,7 +64,7 @@ def test_the_longest_gaps_are_found(record, small_camera, pictures):
             recorder.jpeg("/x/image", T0_NS + index * FRAME_NS, pictures[0], "cam")
         for index in (0, 1, 4):
             recorder.fix("/fix", T0_NS + index * FRAME_NS, (49.0, 8.0, 100.0), "cam")
-    found = inspect_drive(recorder.path)
+    found = look_through(recorder.path).info
     assert found.images is not None
     assert found.gnss is not None
     assert found.images.longest_gap_s == pytest.approx(0.5)
@@ -78,7 +78,7 @@ def lacks(found, what):
 def test_an_empty_recording_lacks_everything(record):
     with record() as recorder:
         pass
-    found = inspect_drive(recorder.path)
+    found = look_through(recorder.path).info
     assert lacks(found, "images")
     assert lacks(found, "GNSS")
     assert (found.images, found.camera, found.gnss, found.antenna, found.start_ns) == (None,) * 5
@@ -88,7 +88,7 @@ def test_fixes_without_images_are_reported(record):
     with record() as recorder:
         recorder.fix("/fix", T0_NS, (49.0, 8.0, 100.0), "gnss")
         recorder.fix("/fix", T0_NS + FRAME_NS, (49.0, 8.0, 100.0), "gnss", status=-1)
-    found = inspect_drive(recorder.path)
+    found = look_through(recorder.path).info
     assert lacks(found, "images")
     assert found.gnss is not None
     assert (found.gnss.fix_count, found.gnss.message_count) == (1, 2)
@@ -98,7 +98,7 @@ def test_fixes_without_images_are_reported(record):
 def test_images_without_the_rest_are_reported(record, pictures):
     with record() as recorder:
         recorder.jpeg("/x/image", T0_NS, pictures[0], "cam")
-    found = inspect_drive(recorder.path)
+    found = look_through(recorder.path).info
     assert lacks(found, "calibration")
     assert lacks(found, "GNSS")
     assert found.images is not None
@@ -111,7 +111,7 @@ def test_each_fault_is_listed_in_one_report(record, small_camera, pictures):
         recorder.jpeg("/x/image", T0_NS, np.zeros((24, 32), np.uint8), "cam", log_ns=T0_NS)
         recorder.jpeg("/x/image", T0_NS - 1, pictures[0], "cam", log_ns=T0_NS + 1)
         recorder.fix("/fix", T0_NS, (49.0, 8.0, 100.0), "gnss", status=-1)
-    found = inspect_drive(recorder.path)
+    found = look_through(recorder.path).info
     assert "32x24" in lacks(found, "calibration for the images' size")[0]
     assert "image 1" in lacks(found, "images in time order")[0]
     assert "none of the 1 messages" in lacks(found, "GNSS")[0]
@@ -122,7 +122,7 @@ def test_an_unreadable_image_is_listed(record, small_camera):
     with record() as recorder:
         recorder.camera_info("/x/camera_info", T0_NS, small_camera, "cam")
         recorder.compressed("/x/image", T0_NS, b"nothing", "jpeg", "cam")
-    found = inspect_drive(recorder.path)
+    found = look_through(recorder.path).info
     assert lacks(found, "readable images")
     assert found.images is not None
     assert found.images.width_px is None
@@ -133,14 +133,14 @@ def test_two_cameras_are_listed_unless_one_is_chosen(record, small_camera, pictu
         for name in ("a", "b"):
             recorder.camera_info(f"/{name}/camera_info", T0_NS, small_camera, name)
             recorder.jpeg(f"/{name}/image", T0_NS, pictures[0], name)
-    assert "--image-topic" in lacks(inspect_drive(recorder.path), "images")[0]
-    assert not lacks(inspect_drive(recorder.path, image_topic="/b/image"), "images")
+    assert "--image-topic" in lacks(look_through(recorder.path).info, "images")[0]
+    assert not lacks(look_through(recorder.path, image_topic="/b/image").info, "images")
     with pytest.raises(DriveError, match="no images on /c"):
-        inspect_drive(recorder.path, image_topic="/c")
+        look_through(recorder.path, image_topic="/c")
 
 
 def test_a_file_that_cannot_be_read_is_an_error(street):
     path = street()
     path.write_bytes(path.read_bytes()[:100])
     with pytest.raises(DriveError, match="truncated"):
-        inspect_drive(path)
+        look_through(path)

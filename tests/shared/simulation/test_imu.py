@@ -11,11 +11,12 @@ import pytest
 from fleetmap.geodesy import UtmAnchor
 from fleetmap.geometry import Pose, rotation_angle_rad, so3_exp
 from fleetmap.simulation.driving import plan_motion
-from fleetmap.simulation.imu import IMU_ERROR_MODELS, PERFECT_IMU, TriadErrorModel, gravity_m_s2, imu_samples
+from fleetmap.simulation.imu import IMU_ERROR_MODELS, ImuErrorModel, TriadErrorModel, gravity_m_s2, imu_samples
 from fleetmap.simulation.motion import Motion, motion_through
 from fleetmap.simulation.mounting import Mounting
 from fleetmap.simulation.street import Street
 
+PERFECT_IMU = ImuErrorModel(TriadErrorModel(0, 0, 0, 0, 0), TriadErrorModel(0, 0, 0, 0, 0))
 _CAM_FROM_IMU = Mounting().cam_from_imu
 
 

@@ -7,8 +7,9 @@ import numpy as np
 from fleetmap.simulation.driving import plan_motion
 from fleetmap.simulation.mounting import Mounting
 from fleetmap.simulation.street import Street
-from fleetmap.simulation.wheel import PERFECT_WHEELS, WheelErrorModel, wheel_speeds
+from fleetmap.simulation.wheel import WheelErrorModel, wheel_speeds
 
+PERFECT_WHEELS = WheelErrorModel(0.0, 0.0, 0.0)
 _CAM_FROM_VEHICLE = Mounting().cam_from_vehicle
 
 
