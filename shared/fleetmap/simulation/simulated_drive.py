@@ -191,7 +191,7 @@ def simulate_drive(
     """
     require_readout(readout_s)
     if isinstance(world, Street):
-        world = World(world.anchor, world.path, world.length_m, False, Scene(world.surfaces, world.atlas))
+        world = World.of_street(world)
     motion = motion_of(world.anchor, trajectory) if motion is None else motion
     mounting = Mounting(camera_height_m, antenna_in_cam_m)
     fixes: list[GnssFix] = []

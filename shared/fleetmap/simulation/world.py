@@ -27,7 +27,7 @@ from fleetmap.simulation.path import Line
 from fleetmap.simulation.plot import Plot
 from fleetmap.simulation.roads import RoadPath
 from fleetmap.simulation.square import lay_open
-from fleetmap.simulation.street import anchor_at, build_street
+from fleetmap.simulation.street import Street, anchor_at, build_street
 from fleetmap.simulation.surfaces import SurfaceBuilder, Surfaces
 from fleetmap.simulation.traffic import Traffic
 
@@ -69,6 +69,11 @@ class World:
     markers: tuple[Marker, ...] = ()
     tunnels_m: tuple[tuple[float, float], ...] = ()  # stretches (start, end) along the path without sky
     traffic: Traffic | None = None
+
+    @staticmethod
+    def of_street(street: Street) -> World:
+        """A street, as a world without traffic."""
+        return World(street.anchor, street.path, street.length_m, False, Scene(street.surfaces, street.atlas))
 
     @property
     def surfaces(self) -> Surfaces:
@@ -127,8 +132,7 @@ def build_world(
     if kind not in WORLD_KINDS:
         raise InputError(f"there is no world of kind {kind!r}; choose from {', '.join(WORLD_KINDS)}")
     if kind == "street":
-        street = build_street(seed, length_m, lat_deg=lat_deg, lon_deg=lon_deg, height_m=height_m)
-        return World(street.anchor, street.path, street.length_m, False, Scene(street.surfaces, street.atlas))
+        return World.of_street(build_street(seed, length_m, lat_deg=lat_deg, lon_deg=lon_deg, height_m=height_m))
     _require_sense(length_m, parked_cars_changed, moving_cars_per_km)
     anchor = anchor_at(lat_deg, lon_deg, height_m)
     plan_rng, far_rng = np.random.default_rng(seed).spawn(2)
