@@ -18,9 +18,10 @@ import click
 import numpy as np
 
 from fleetmap.camera import Camera
+from fleetmap.drive import START_NS
 from fleetmap.errors import InputError, OutputExistsError, ServerError, StorageError
 from fleetmap.files import atomic_path
-from fleetmap.simulation.driving import START_NS, drive_along
+from fleetmap.simulation.driving import drive_along
 from fleetmap.simulation.look import Look
 from fleetmap.simulation.recording import record_drive
 from fleetmap.simulation.simulated_drive import simulate_drive

@@ -13,6 +13,8 @@ from fleetmap.camera import Camera
 
 Array = NDArray[np.float64]
 
+START_NS = 1_700_000_000_000_000_000  # 2023-11-14T22:13:20Z: where relative and simulated times start
+
 
 @dataclass(frozen=True)
 class Frame:

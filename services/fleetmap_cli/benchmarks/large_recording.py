@@ -10,10 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from fleetmap.camera import Camera
-from fleetmap.drive import GnssFix
+from fleetmap.drive import START_NS, GnssFix
 from fleetmap.drives.ros2_writer import DriveWriter
 
-_START_NS = 1_700_000_000_000_000_000
 _FRAME_NS = 100_000_000
 _METRES_PER_DEGREE = 111_320.0
 
@@ -29,7 +28,7 @@ def write_large_recording(path: Path, jpegs: Sequence[bytes], camera: Camera, si
         for number, jpeg in zip(count(), cycle(jpegs)):
             if written_bytes >= size_bytes:
                 break
-            stamp_ns = _START_NS + number * _FRAME_NS
+            stamp_ns = START_NS + number * _FRAME_NS
             writer.write_jpeg(stamp_ns, jpeg)
             lat_deg = 49.0 + number / _METRES_PER_DEGREE  # a metre an image
             writer.write_fix(GnssFix(stamp_ns, lat_deg, 8.4, 120.0, np.eye(3) * 0.0025), "camera")

@@ -27,8 +27,6 @@ from fleetmap.trajectory import Trajectory, write_trajectory
 Progress = Callable[[str, int, int], None]  # stage, done, total
 Message = tuple[int, Callable[[], None]]  # its stamp in ns, and what writes it
 
-START_NS = 1_700_000_000 * 1_000_000_000  # 2023-11-14T22:13:20Z: where recordings with relative times start
-
 _JPEG_MAGIC, _PNG_MAGIC = b"\xff\xd8", b"\x89PNG\r\n\x1a\n"
 _LAST_ROS_STAMP_NS = (2**31 - 1) * 1_000_000_000  # builtin_interfaces/Time counts seconds in 32 bits, until 2038
 

@@ -12,9 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from fleetmap.camera import Camera
-from fleetmap.drive import GnssFix
+from fleetmap.drive import START_NS, GnssFix
 from fleetmap.drives.conversion import (
-    START_NS,
     Conversion,
     Progress,
     SimulatedGnss,

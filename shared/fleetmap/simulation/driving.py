@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 
+from fleetmap.drive import START_NS
 from fleetmap.errors import InputError
 from fleetmap.geodesy import UtmAnchor
 from fleetmap.geometry import so3_exp
@@ -18,7 +19,6 @@ from fleetmap.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
-START_NS = 1_700_000_000_000_000_000  # 2023-11-14T22:13:20Z
 FASTEST_MPS, HIGHEST_RATE_HZ = 70.0, 200.0
 
 _STEP_M = 1.0  # between the points of the lane that the car's line goes through, smoothly

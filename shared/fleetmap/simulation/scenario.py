@@ -7,9 +7,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fleetmap.camera import Camera
+from fleetmap.drive import START_NS
 from fleetmap.errors import InputError
 from fleetmap.geodesy import UtmGrid
-from fleetmap.simulation.driving import START_NS, image_stamps_ns, plan_motion, require_rate, require_speed
+from fleetmap.simulation.driving import image_stamps_ns, plan_motion, require_rate, require_speed
 from fleetmap.simulation.look import look_of_drive
 from fleetmap.simulation.receiver import Receiver
 from fleetmap.simulation.simulated_drive import Sensors, SimulatedDrive, require_readout, simulate_drive

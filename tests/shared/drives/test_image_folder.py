@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from fleetmap.camera import Camera
+from fleetmap.drive import START_NS
 from fleetmap.drives import open_drive
-from fleetmap.drives.conversion import START_NS
 from fleetmap.drives.image_folder import ImageClock, convert_image_folder
 from fleetmap.drives.image_folder_tables import UNKNOWN_HEIGHT_SIGMA_M, PositionDefaults
 from fleetmap.errors import CalibrationError, DriveError, InputError

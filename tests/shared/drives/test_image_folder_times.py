@@ -6,7 +6,7 @@ import struct
 
 import pytest
 
-from fleetmap.drives.conversion import START_NS
+from fleetmap.drive import START_NS
 from fleetmap.drives.image_folder_exif import time_taken_ns
 from fleetmap.drives.image_folder_times import clock_text, time_in_name_ns, time_ns
 

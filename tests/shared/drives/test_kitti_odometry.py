@@ -11,8 +11,9 @@ import pytest
 from pyproj import Geod
 
 from fleetmap.camera import Camera
+from fleetmap.drive import START_NS
 from fleetmap.drives import open_drive
-from fleetmap.drives.conversion import START_NS, SimulatedGnss
+from fleetmap.drives.conversion import SimulatedGnss
 from fleetmap.drives.kitti_odometry import Origin, convert_kitti_odometry
 from fleetmap.errors import CalibrationError, DriveError, InputError
 from fleetmap.geodesy import UtmGrid

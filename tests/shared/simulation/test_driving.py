@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from fleetmap.drive import START_NS
 from fleetmap.errors import InputError
 from fleetmap.geometry import Pose, rotation_angle_rad
-from fleetmap.simulation.driving import START_NS, drive_along, plan_motion
+from fleetmap.simulation.driving import drive_along, plan_motion
 from fleetmap.simulation.street import Street
 from fleetmap.simulation.world import build_world
 

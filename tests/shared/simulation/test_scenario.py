@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from fleetmap.camera import Camera
-from fleetmap.simulation.driving import START_NS
+from fleetmap.drive import START_NS
 from fleetmap.simulation.scenario import Scenario, simulate_scenario
 
 _TINY = Camera(8, 8, 6.0, 6.0, 3.5, 3.5)
