@@ -19,17 +19,19 @@ from fleetmap.trajectory import write_trajectory
 from fleetmap_cli.progress import StageBar
 from fleetmap_cli.verbs.publish import publish_package
 from fleetmap_cli.watching import STATE_FOLDER, UnfitMapError
+from fleetmap_mapper.image_mask import read_mask
 from fleetmap_mapper.mapper import map_drive
 from fleetmap_mapper.settings import MapperSettings
 
 
 @dataclass(frozen=True)
 class DriveChoice:
-    """Which parts of a recording to map; see fleetmap.drives.open_drive."""
+    """Which parts of a recording to map, see fleetmap.drives.open_drive, and of its images, see read_mask."""
 
     image_topic: str | None = None
     gnss_topic: str | None = None
     antenna_offset_m: tuple[float, float, float] | None = None
+    mask: Path | None = None  # white where images may be used
 
 
 def map_recording(
@@ -56,8 +58,9 @@ def map_recording(
         gnss_topic=choice.gnss_topic,
         antenna_offset_m=choice.antenna_offset_m,
     )
+    mask = read_mask(choice.mask, drive.camera) if choice.mask is not None else None
     with StageBar() as bar:
-        mapped = map_drive(drive, settings, bar)
+        mapped = map_drive(drive, settings, bar, mask)
     stamps_ns = mapped.trajectory.stamps_ns
     provenance = Provenance(
         drive=drive.name,

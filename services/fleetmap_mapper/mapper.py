@@ -17,13 +17,15 @@ from fleetmap.manifest import Quality
 from fleetmap.trajectory import Trajectory
 from fleetmap.visual_map import VisualMap
 from fleetmap_mapper.alignment import GnssAligner
+from fleetmap_mapper.drive_slam import run_slam
 from fleetmap_mapper.georeferenced_map import adjust_with_fixes, place, pose_frames, without_outliers
 from fleetmap_mapper.georeferencing import GnssTrack, georeference, gnss_track, path_at_fixes
+from fleetmap_mapper.image_mask import ImageMask
 from fleetmap_mapper.map_building import build_visual_map
 from fleetmap_mapper.quality import assess
 from fleetmap_mapper.segments import join_segments
 from fleetmap_mapper.settings import MapperSettings
-from fleetmap_mapper.slam import PosedFrame, Segment, run_slam
+from fleetmap_mapper.slam import PosedFrame, Segment
 from fleetmap_mapper.stage_times import StageTimes
 
 _log = logging.getLogger(__name__)
@@ -40,8 +42,13 @@ class MappedDrive:
     quality: Quality
 
 
-def map_drive(drive: Drive, settings: MapperSettings, progress: Progress = lambda *_: None) -> MappedDrive:
-    """Turn a survey drive into a map anchored in UTM.
+def map_drive(
+    drive: Drive,
+    settings: MapperSettings,
+    progress: Progress = lambda *_: None,
+    mask: ImageMask | None = None,
+) -> MappedDrive:
+    """Turn a survey drive into a map anchored in UTM; what a mask ignores never becomes part of it.
 
     Raises:
         DriveError: no GNSS, too little of it, or images that cannot be read or tracked.
@@ -50,7 +57,7 @@ def map_drive(drive: Drive, settings: MapperSettings, progress: Progress = lambd
     track = gnss_track(drive.gnss_fixes(), drive.antenna().position_in_cam_m)
     aligner = GnssAligner(track, settings) if settings.gnss.mode == "full" else None
     times, start_s = StageTimes(), time.perf_counter()
-    segments = run_slam(_counted(drive, progress), drive.camera, settings, aligner, times)
+    segments = run_slam(_counted(drive, progress), drive.camera, settings, aligner, times, mask)
     _report_speed(sum(len(s.posed) for s in segments), time.perf_counter() - start_s, times)
 
     progress("placing the map", 0, 1)

@@ -1,4 +1,4 @@
-"""Monocular keyframe SLAM over a recorded drive, in a free-scale frame ``vis``.
+"""Monocular keyframe SLAM over frames in order, in a free-scale frame ``vis``.
 
 The parts follow the usual division (Mur-Artal et al., "ORB-SLAM", T-RO 2015): two-view initialisation,
 tracking against the local map, keyframes, triangulation, fusion, local bundle adjustment, relocalisation.
@@ -7,29 +7,24 @@ A recorded drive is known whole, so frames before the first map are posed as wel
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable, Iterable, Iterator, Reversible
+from collections.abc import Callable, Reversible
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.camera import Camera
-from fleetmap.drive import Frame
-from fleetmap.errors import DriveError
 from fleetmap.geometry import Pose, interpolate_pose, rotation_angle_rad
-from fleetmap.vision.features import FeatureExtractor, Features, FeatureSettings
+from fleetmap.vision.features import Features
 from fleetmap_mapper.growing_map import GrowingMap, Ids, Keyframe
 from fleetmap_mapper.initialisation import map_from_two_views, match_two_views
 from fleetmap_mapper.local_mapping import adjust_keyframes, extend_map
-from fleetmap_mapper.read_ahead import read_ahead
 from fleetmap_mapper.settings import MapperSettings
 from fleetmap_mapper.stage_times import StageTimes
 from fleetmap_mapper.tracking import Tracked, relocalise, track
 
 _YOUNG_MAP_KEYFRAMES = 5  # losing track of a younger map means that its first two views misled
 _RELOCALISE_AGAINST = 10
-_FRAMES_AHEAD = 8
 
 
 @dataclass(frozen=True)
@@ -240,72 +235,6 @@ class Slam:
                 tracked = self._track(waiting[index])
                 if tracked is not None:
                     self._remember(waiting[index], tracked, neighbour.keyframe)
-
-
-def run_slam(
-    frames: Iterable[Frame],
-    camera: Camera,
-    settings: MapperSettings,
-    on_keyframe: OnKeyframe | None = None,
-    times: StageTimes | None = None,
-) -> list[Segment]:
-    """Feed a whole drive through SLAM; where tracking is lost for good, a new segment begins.
-
-    Raises:
-        DriveError: no two images of the drive ever made a map.
-    """
-    times = times or StageTimes()
-    current, successor = Slam(camera, settings, on_keyframe, times), None
-    segments = []
-    for unposed in _features_ahead(frames, camera, settings, times):
-        current.register_frame(unposed)
-        if len(current.lost) < settings.tracking.patience_frames:
-            successor = None
-            continue
-        if successor is None:
-            successor = Slam(camera, settings, on_keyframe, times)
-            for earlier in current.lost[:-1]:
-                successor.register_frame(earlier)
-        successor.register_frame(unposed)
-        if successor.is_established:
-            segments.append(Segment(current.growing, current.finish()))
-            current, successor = successor, None
-    segments.append(Segment(current.growing, current.finish()))
-    segments = [segment for segment in segments if segment.posed]
-    if not segments:
-        raise DriveError(
-            "no map could be started: the images show too little texture, or the camera never moved; "
-            "look at them, and at their exposure"
-        )
-    return segments
-
-
-def _features_ahead(
-    frames: Iterable[Frame], camera: Camera, settings: MapperSettings, times: StageTimes
-) -> Iterator[Unposed]:
-    """The frames' features in order, found by another thread while earlier frames are being tracked."""
-    coming = read_ahead(_with_features(frames, camera, settings, times), _FRAMES_AHEAD)
-    while True:
-        with times.stage("waiting for features"):
-            unposed = next(coming, None)
-        if unposed is None:
-            return
-        yield unposed
-
-
-def _with_features(
-    frames: Iterable[Frame], camera: Camera, settings: MapperSettings, times: StageTimes
-) -> Iterator[Unposed]:
-    extractor = FeatureExtractor(camera, FeatureSettings(count=settings.features.count))
-    iterator = iter(frames)
-    for index in itertools.count():
-        with times.stage("reading"):
-            frame = next(iterator, None)
-        if frame is None:
-            return
-        with times.stage("finding features"):
-            features = extractor.extract(frame.image)
-        yield Unposed(index, frame.stamp_ns, features)
 
 
 def _none(features: Features) -> Ids:

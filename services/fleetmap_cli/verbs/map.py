@@ -26,11 +26,11 @@ _UNFIT = 3
 @click.option("--trajectory", type=_FILE, metavar="OUT.tum", help="Write the pose of every image (TUM text, UTM).")
 @click.option(
     "--gnss",
-    type=click.Choice(["none", "final", "full"]),
+    type=click.Choice(["none", "mapping", "final", "full"]),
     default="full",
     show_default=True,
-    help="How fixes shape the map: 'none' places plain SLAM with one Sim(3) at the end, 'final' adds the joint "
-    "adjustment at the end, 'full' also aligns while mapping.",
+    help="How fixes shape the map: 'none' places plain SLAM with one Sim(3) at the end; 'mapping' also aligns while "
+    "mapping; 'final' is 'none' with a joint adjustment at the end; 'full' does both.",
 )
 @click.option("--map-id", metavar="ID", help="The map's id in the catalogue.  [default: the output folder's name]")
 @click.option("--image-topic", metavar="TOPIC", help="Which camera, where the recording holds several.")
@@ -39,6 +39,12 @@ _UNFIT = 3
     "--antenna-offset",
     type=XYZ,
     help="Antenna from the camera centre in metres: forward, left, up; used where the recording does not say.",
+)
+@click.option(
+    "--mask",
+    type=_FILE,
+    metavar="MASK.png",
+    help="Use only what is white in this picture of the images' size; black hides the own bonnet, for example.",
 )
 @click.option(
     "--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True, help="Of all random draws."
@@ -59,6 +65,7 @@ def map_(
     image_topic: str | None,
     gnss_topic: str | None,
     antenna_offset: tuple[float, float, float] | None,
+    mask: Path | None,
     seed: int,
     force: bool,
     verbose: bool,
@@ -78,7 +85,7 @@ def map_(
     if verbose:
         logging.getLogger("fleetmap_mapper").setLevel(logging.INFO)
     settings = MapperSettings(seed=seed, gnss=GnssGroup(mode=gnss))
-    choice = DriveChoice(image_topic, gnss_topic, antenna_offset)
+    choice = DriveChoice(image_topic, gnss_topic, antenna_offset, mask)
     if watch is not None:
         if recording or output or trajectory or map_id or force:
             raise click.UsageError(
