@@ -55,7 +55,7 @@ def map_drive(
         CalibrationError: no usable camera model.
     """
     track = gnss_track(drive.gnss_fixes(), drive.antenna().position_in_cam_m)
-    aligner = GnssAligner(track, settings) if settings.gnss.mode == "full" else None
+    aligner = GnssAligner(track, settings) if settings.gnss.mode in ("mapping", "full") else None
     times, start_s = StageTimes(), time.perf_counter()
     segments = run_slam(_counted(drive, progress), drive.camera, settings, aligner, times, mask)
     _report_speed(sum(len(s.posed) for s in segments), time.perf_counter() - start_s, times)
@@ -64,7 +64,7 @@ def map_drive(
     joined, map_from_vis = _placed_segments(segments, track, settings)
     growing, posed = joined.growing, joined.posed
     placed = place(growing, Sim3.identity())
-    if settings.gnss.mode == "none":
+    if settings.gnss.mode in ("none", "mapping"):
         placed = without_outliers(placed)
     else:
         placed = adjust_with_fixes(placed, growing, posed, track, settings.gnss.level_sigma_deg, progress)

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-GnssMode = Literal["none", "final", "full"]
+GnssMode = Literal["none", "mapping", "final", "full"]
 
 
 class _Group(BaseModel):

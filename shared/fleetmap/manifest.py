@@ -163,7 +163,7 @@ class Quality(_Model):
     reprojection_rms_px: float
     gnss_fixes: Total
     gnss_residual_rms_m: float | None
-    gnss_mode: Literal["none", "final", "full"]
+    gnss_mode: Literal["none", "mapping", "final", "full"]
     publishable: bool
     warnings: tuple[str, ...] = ()
 

@@ -50,7 +50,15 @@ def patchy_drive(survey_frames, write_drive, tmp_path_factory) -> Path:
 def test_help_teaches(fleetmap):
     code, out, _ = fleetmap("map", "--help")
     assert code == 0
-    for word in ("--output", "--trajectory", "--gnss", "[none|final|full]", "--watch", "exit code 3", "Examples:"):
+    for word in (
+        "--output",
+        "--trajectory",
+        "--gnss",
+        "[none|mapping|final|full]",
+        "--watch",
+        "exit code 3",
+        "Examples:",
+    ):
         assert word in out
 
 
@@ -138,7 +146,10 @@ def test_an_antenna_behind_and_to_the_right_is_given_with_a_leading_minus(
     [
         ([], "give a RECORDING and --output FOLDER, or --watch DIR"),
         (["drive.mcap"], "give a RECORDING and --output FOLDER, or --watch DIR"),
-        (["drive.mcap", "--output", "m", "--gnss", "some"], "'some' is not one of 'none', 'final', 'full'"),
+        (
+            ["drive.mcap", "--output", "m", "--gnss", "some"],
+            "'some' is not one of 'none', 'mapping', 'final', 'full'",
+        ),
         (["drive.mcap", "--output", "m", "--antenna-offset", "-1,2"], "'-1,2' is not X,Y,Z"),
         (["drive.mcap", "--output", "m", "--seed", "-1"], "-1 is not in the range"),
         (["drive.mcap", "--output", "m", "--server", "tcp/127.0.0.1:7447"], "--server goes with --watch"),
