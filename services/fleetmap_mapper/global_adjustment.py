@@ -62,13 +62,8 @@ class GlobalOptimum:
 
 def adjust_globally(problem: GlobalProblem, max_iterations: int = 30) -> GlobalOptimum:
     """Run Levenberg-Marquardt on the whole graph."""
-    graph = gtsam.NonlinearFactorGraph()
+    graph, values = graph_without_images(problem)
     _add_observations(graph, problem)
-    _add_fixes(graph, problem.fixes)
-    _add_level_prior(graph, len(problem.poses), problem.level_sigma_rad)
-    values = gtsam.Values()
-    for i, pose in enumerate(problem.poses):
-        values.insert(X(i), gtsam.Pose3(gtsam.Rot3(pose.rotation), pose.translation_m))
     for j, point in enumerate(problem.points_m):
         values.insert(L(j), point)
     parameters = gtsam.LevenbergMarquardtParams()
@@ -85,6 +80,16 @@ def adjust_globally(problem: GlobalProblem, max_iterations: int = 30) -> GlobalO
         initial_cost,
         float(optimizer.error()),
     )
+
+
+def graph_without_images(problem: GlobalProblem) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+    """All that is known of the poses besides what they see, and where they start (keys X)."""
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    _add_fixes(graph, problem.fixes)
+    _add_level_prior(graph, len(problem.poses), problem.level_sigma_rad)
+    for i, pose in enumerate(problem.poses):
+        values.insert(X(i), gtsam.Pose3(gtsam.Rot3(pose.rotation), pose.translation_m))
+    return graph, values
 
 
 def _add_observations(graph: gtsam.NonlinearFactorGraph, problem: GlobalProblem) -> None:

@@ -65,6 +65,21 @@ class GnssGroup(_Group):
     level_sigma_deg: float = 0.5  # how level the camera's horizontal axis is taken to be, averaged over a drive
 
 
+class CalibrationGroup(_Group):
+    """The camera's calibration: how far a recorded one may be off, and when the drive contradicts it.
+
+    The sigmas of a calibration made in a workshop, on another day: they hold what a drive does not determine.
+    """
+
+    refine: bool = False  # estimate it together with poses and landmarks
+    focal_sigma_ratio: float = Field(default=0.03, gt=0.0)  # of the focal length
+    aspect_sigma_ratio: float = Field(default=0.002, gt=0.0)  # of fx against fy: how square pixels are
+    centre_sigma_ratio: float = Field(default=0.015, gt=0.0)  # of the image width
+    distortion_sigma_ratio: float = Field(default=0.015, gt=0.0)  # of the image width, at its farthest corner
+    warn_sigmas: float = 4.0  # a disagreement is told that is as clear as this ...
+    warn_border_px: float = 2.0  # ... and shifts pixels at the image border by as much
+
+
 class QualityGroup(_Group):
     """When a map is fit to publish."""
 
@@ -84,4 +99,5 @@ class MapperSettings(_Group):
     keyframes: KeyframeGroup = KeyframeGroup()
     mapping: MappingGroup = MappingGroup()
     gnss: GnssGroup = GnssGroup()
+    calibration: CalibrationGroup = CalibrationGroup()
     quality: QualityGroup = QualityGroup()

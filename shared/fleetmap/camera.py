@@ -11,10 +11,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.distortion import COEFFICIENT_COUNTS, DistortionModel, distort, is_distorting, undistort
+from fleetmap.distortion import COEFFICIENT_COUNTS, DistortionModel, distort, is_distorting, jacobian, undistort
 from fleetmap.errors import CalibrationError
 
 Array = NDArray[np.float64]
+
+WIDEST_ANGLE_DEG = 75.0
+"""Off the optical axis; what a fisheye lens sees further out takes no part in mapping.
+
+Landmarks are measured in the undistorted image, where an error of one recorded pixel grows with 1 / cos^2: 15-fold
+at this angle, without bounds at 90 degrees.
+"""
 
 
 @dataclass(frozen=True)
@@ -83,6 +90,43 @@ class Camera:
         centre, focal = np.array([self.cx_px, self.cy_px]), np.array([self.fx_px, self.fy_px])
         ideal = undistort(self.distortion_model, self.distortion, (pixels - centre) / focal)
         return np.asarray(ideal * focal + centre)
+
+    def distort(self, ideal_pixels: Array) -> Array:
+        """The inverse of :meth:`undistort`: where the sensor sees pixels (N, 2) of the undistorted camera.
+
+        NaN beyond what the lens images.
+        """
+        if not self.has_distortion:
+            return np.asarray(ideal_pixels, dtype=np.float64)
+        return self._pixels(self._distort(self.normalise(ideal_pixels)))
+
+    def normalise(self, ideal_pixels: Array) -> Array:
+        """Normalised image coordinates (N, 2), x / z and y / z, of undistorted pixels (N, 2)."""
+        return np.asarray((ideal_pixels - [self.cx_px, self.cy_px]) / [self.fx_px, self.fy_px])
+
+    def is_within_reach(self, ideal_pixels: Array) -> NDArray[np.bool_]:
+        """Which undistorted pixels (N, 2) lie at most ``WIDEST_ANGLE_DEG`` off the optical axis."""
+        square = (self.normalise(ideal_pixels) ** 2).sum(axis=1)
+        return np.asarray(square <= np.tan(np.radians(WIDEST_ANGLE_DEG)) ** 2)
+
+    def magnification(self, ideal_pixels: Array) -> Array:
+        """How far a recorded pixel's error is stretched, at most, by undistorting it: (N,) for pixels (N, 2).
+
+        The larger singular value of d undistorted / d recorded; 1 where nothing is distorted.
+        """
+        if not self.has_distortion:
+            return np.ones(len(ideal_pixels))
+        aspect = self.fx_px / self.fy_px
+        J = jacobian(self.distortion_model, self.distortion, self.normalise(ideal_pixels))
+        a, b, c, d = J[:, 0, 0], J[:, 0, 1] * aspect, J[:, 1, 0] / aspect, J[:, 1, 1]
+        squares = a * a + b * b + c * c + d * d
+        # sigma_1 and sigma_2 of J: (sigma_1 +- sigma_2)^2 = squares +- 2 |det|; wanted is 1 / sigma_2.
+        determinant = np.abs(a * d - b * c)
+        larger = 0.5 * (
+            np.sqrt(squares + 2.0 * determinant) + np.sqrt(np.maximum(squares - 2.0 * determinant, 0.0))
+        )
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(larger / determinant)
 
     def is_inside(self, pixels: Array, border_px: float = 0.0) -> NDArray[np.bool_]:
         """Which pixels (N, 2) lie in the image, at least ``border_px`` from its edge; NaN is outside."""

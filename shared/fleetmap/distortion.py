@@ -70,6 +70,35 @@ def undistort(model: DistortionModel, coefficients: Coefficients, distorted: Arr
     return np.where(found[:, None], ideal, np.nan)
 
 
+def jacobian(model: DistortionModel, coefficients: Coefficients, ideal: Array) -> Array:
+    """d distorted / d ideal (N, 2, 2) at normalised points (N, 2); means nothing where :func:`distort` is NaN."""
+    if model == "equidistant":
+        return _equidistant_jacobian(coefficients, ideal)
+    _, (xx, xy, yx, yy) = _brown_conrady(coefficients, ideal, with_derivatives=True)
+    return np.stack([np.stack([xx, xy], axis=1), np.stack([yx, yy], axis=1)], axis=1)
+
+
+def coefficient_jacobian(model: DistortionModel, coefficients: Coefficients, ideal: Array) -> Array:
+    """d distorted / d coefficients (N, 2, C) at normalised points (N, 2)."""
+    if model == "equidistant":
+        radius = np.linalg.norm(ideal, axis=1)
+        theta = np.arctan(radius)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            direction = np.where(radius[:, None] > 1e-12, ideal / radius[:, None], 0.0)
+        return np.asarray(direction[:, :, None] * (theta[:, None] ** [3, 5, 7, 9])[:, None, :])
+    numerator, denominator = _radial_polynomials(coefficients)
+    x, y = ideal[:, 0], ideal[:, 1]
+    r2 = x * x + y * y
+    bottom = np.polyval(denominator, r2)
+    powers = ideal[:, :, None] * (r2[:, None] ** [1, 2, 3] / bottom[:, None])[:, None, :]  # by k1, k2, k3
+    by_p1 = np.stack([2.0 * x * y, r2 + 2.0 * y * y], axis=1)[:, :, None]
+    by_p2 = np.stack([r2 + 2.0 * x * x, 2.0 * x * y], axis=1)[:, :, None]
+    columns = [powers[:, :, :2], by_p1, by_p2, powers[:, :, 2:]]
+    if len(coefficients) > COEFFICIENT_COUNTS["plumb_bob"]:
+        columns.append(powers * -(np.polyval(numerator, r2) / bottom)[:, None, None])
+    return np.concatenate(columns, axis=2)
+
+
 def _within(points: Array, reach: float) -> Array:
     """Points (N, 2) pulled back to where the polynomial still grows: Newton's first step may overshoot."""
     radius = np.linalg.norm(points, axis=1, keepdims=True)
@@ -132,6 +161,19 @@ def _distort_equidistant(coefficients: Coefficients, ideal: Array) -> Array:
     with np.errstate(divide="ignore", invalid="ignore"):
         factor = np.where(radius > 1e-12, theta_d / radius, 1.0)
     return np.where((theta < _turning_angle_rad(coefficients))[:, None], ideal * factor[:, None], np.nan)
+
+
+def _equidistant_jacobian(coefficients: Coefficients, ideal: Array) -> Array:
+    """Along the radius and across it the lens stretches differently: I t + n n^T (s - t)."""
+    radius = np.linalg.norm(ideal, axis=1)
+    theta = np.arctan(radius)
+    square = theta * theta
+    radial = np.polyval(_slope_polynomial(coefficients), square) / (1.0 + radius * radius)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        across = np.where(radius > 1e-12, theta * np.polyval(_theta_polynomial(coefficients), square) / radius, 1.0)
+        outwards = np.where(radius[:, None] > 1e-12, ideal / radius[:, None], 0.0)
+    along = np.einsum("n,ni,nj->nij", radial - across, outwards, outwards)
+    return np.asarray(across[:, None, None] * np.eye(2) + along)
 
 
 def _undistort_equidistant(coefficients: Coefficients, distorted: Array) -> Array:
