@@ -6,6 +6,8 @@ model    error per axis (true east, north, up)                        reported s
 rtk      0.05 m white                                                 0.05 m
 consumer Gauss-Markov bias (1 m, 1 m, 1.5 m; 100 s) + 0.1 m white      1.5 m
 ======== ============================================================ ==============
+
+With either, a share of the fixes may be outliers: 5 to 50 m off in any direction, while they report that sigma.
 """
 
 from __future__ import annotations
@@ -27,6 +29,9 @@ Stamps = NDArray[np.int64]
 
 FIRST_FIX_AFTER_FIRST_IMAGE_NS = 37_000_000
 LAST_FIX_BEFORE_LAST_IMAGE_NS = 1_000_000
+OUTLIER_DISTANCES_M = 5.0, 50.0
+
+_OUTLIER_STREAM = 1  # beside the seed: outliers are drawn apart, so that all other fixes stay the same
 
 
 @dataclass(frozen=True)
@@ -64,6 +69,7 @@ def sample_fixes(
     interval_s: float = 0.1,
     gap_s: tuple[float, float] | None = None,
     antenna_in_cam_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    outlier_ratio: float = 0.0,
     seed: int = 0,
 ) -> list[GnssFix]:
     """The fixes a receiver would have reported along a reference that has one pose per image.
@@ -75,25 +81,36 @@ def sample_fixes(
         gap_s: start (seconds since the first image) and length of a stretch without fixes; the fixes
             outside it are the same with and without a gap.
         antenna_in_cam_m: the antenna in the camera's frame.
+        outlier_ratio: the share of the fixes that are far off and do not know it.
         seed: the same seed gives the same fixes.
 
     Raises:
-        InputError: a reference of fewer than two poses, or a spacing or gap that makes no sense.
+        InputError: a reference of fewer than two poses, or a spacing, gap or share that makes no sense.
     """
     stamps_ns = fix_stamps_ns(reference.stamps_ns, interval_s)
     positions_m = antenna_positions_m(reference, stamps_ns, antenna_in_cam_m)
     return [
         fix
-        for fix in fixes_at(UtmGrid(reference.epsg), stamps_ns, positions_m, model, seed)
+        for fix in fixes_at(UtmGrid(reference.epsg), stamps_ns, positions_m, model, seed, outlier_ratio)
         if gap_s is None or not in_gap(fix.stamp_ns - int(reference.stamps_ns[0]), gap_s)
     ]
 
 
 def fixes_at(
-    grid: UtmGrid, stamps_ns: Stamps, antennas_in_utm_m: Array, model: GnssErrorModel, seed: int
+    grid: UtmGrid,
+    stamps_ns: Stamps,
+    antennas_in_utm_m: Array,
+    model: GnssErrorModel,
+    seed: int,
+    outlier_ratio: float = 0.0,
 ) -> list[GnssFix]:
-    """The fixes that a receiver reports of its antenna's true positions (N, 3) at stamps (N,)."""
+    """The fixes that a receiver reports of its antenna's true positions (N, 3) at stamps (N,).
+
+    Raises:
+        InputError: a share of outliers that makes no sense.
+    """
     errors_enu_m = model.sample_errors_enu_m(stamps_ns, np.random.default_rng(seed))
+    errors_enu_m += sample_outliers_enu_m(len(stamps_ns), outlier_ratio, seed)
     lat_deg, lon_deg, height_m = grid.to_geodetic(_displace(grid, antennas_in_utm_m, errors_enu_m))
     covariance_enu_m2 = np.eye(3) * model.reported_sigma_m**2
     return [
@@ -102,6 +119,30 @@ def fixes_at(
             stamps_ns.tolist(), lat_deg.tolist(), lon_deg.tolist(), height_m.tolist(), strict=True
         )
     ]
+
+
+def sample_outliers_enu_m(count: int, ratio: float, seed: int) -> Array:
+    """What outliers add to the errors of ``count`` fixes, (N, 3) true east, north, up; zero for all the others.
+
+    The share is met exactly but for rounding. Distances are even between 5 and 50 m, directions over the sphere.
+
+    Raises:
+        InputError: no share.
+    """
+    require_outlier_ratio(ratio)
+    generator = np.random.default_rng([seed, _OUTLIER_STREAM])
+    chosen = generator.permutation(count)[: round(ratio * count)]
+    directions = generator.normal(size=(count, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    added = np.zeros((count, 3))
+    added[chosen] = (directions * generator.uniform(*OUTLIER_DISTANCES_M, (count, 1)))[chosen]
+    return added
+
+
+def require_outlier_ratio(ratio: float) -> None:
+    """Raise InputError unless it is a share."""
+    if not 0.0 <= ratio <= 1.0:
+        raise InputError(f"outliers cannot be {ratio:g} of the GNSS fixes; give a share of 0 to 1")
 
 
 def fix_stamps_ns(image_stamps_ns: Stamps, interval_s: float) -> Stamps:

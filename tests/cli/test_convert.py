@@ -99,10 +99,12 @@ def test_an_existing_recording_needs_force(fleetmap, flat_odometry, tmp_path):
     [
         (["--gnss-interval-s", "1"], "need --gnss-error"),
         (["--gnss-gap", "1:1"], "need --gnss-error"),
+        (["--gnss-outliers", "0.2"], "need --gnss-error"),
         (["--antenna-in-camera", "0,0,0"], "need --gnss-error"),
         (["--gnss-error", "perfect"], "'perfect' is not one of 'rtk', 'consumer'"),
         (["--gnss-error", "rtk", "--gnss-interval-s", "0"], "interval of 0.0 s"),
         (["--gnss-error", "rtk", "--gnss-gap", "11"], "START_S:LENGTH_S"),
+        (["--gnss-error", "rtk", "--gnss-outliers", "20"], "share of 0 to 1"),
         (["--gnss-error", "rtk", "--gnss-gap", "1:-1"], "START_S:LENGTH_S"),
         (["--gnss-error", "rtk", "--antenna-in-camera", "1,2"], "X,Y,Z"),
         (["--origin", "49,8,100"], "LAT,LON,HEIGHT,HEADING_DEG"),

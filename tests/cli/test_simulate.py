@@ -128,6 +128,7 @@ def test_receivers_err_as_they_are_told(fleetmap: Run, tmp_path: Path, short: li
     variants = {
         "rtk": ["--gnss", "rtk", *often],
         "consumer": ["--gnss", "consumer", *often],
+        "wild": ["--gnss", "rtk", *often, "--gnss-outliers", 0.25],
         "late": ["--gnss", "rtk", *often, "--gnss-clock-offset-s", 0.25, "--gnss-gap", "0.3:0.5"],
     }
     fixes = {}
@@ -147,6 +148,13 @@ def test_receivers_err_as_they_are_told(fleetmap: Run, tmp_path: Path, short: li
         at_s = [(fix.stamp_ns - int(reference.stamps_ns[0])) * 1e-9 for fix in fixes[name]]
         true = np.stack([np.interp(at_s, since_s, reference.positions_m[:, i]) for i in range(3)], axis=1)
         errors_m[name] = np.abs(in_utm - true)
+    wild = {fix.stamp_ns: fix for fix in fixes["wild"]}
+    moved = [
+        fix
+        for fix in fixes["rtk"]
+        if (wild[fix.stamp_ns].lat_deg, wild[fix.stamp_ns].lon_deg) != (fix.lat_deg, fix.lon_deg)
+    ]
+    assert len(moved) == round(0.25 * len(fixes["rtk"]))
     assert 0.02 < errors_m["rtk"].mean() < 0.07
     assert 0.2 < errors_m["consumer"].mean() < 3.0
     assert [np.sqrt(fixes[name][0].covariance_enu_m2[0, 0]) for name in ("rtk", "consumer")] == [0.05, 1.5]
@@ -166,6 +174,7 @@ BROKEN = {
     "interval": (["--gnss-interval-s", "0"], "interval of 0.0 s"),
     "clock": (["--gnss-clock-offset-s", "1000"], "clock"),
     "gap": (["--gnss-gap", "soon"], "START_S:LENGTH_S"),
+    "outliers": (["--gnss-outliers", "20"], "share of 0 to 1"),
     "receiver": (["--gnss", "perfect"], "perfect"),
     "kind": (["--kind", "moon"], "moon"),
     "look": (["--look", "fog"], "fog"),

@@ -11,7 +11,15 @@ from pyproj import Geod
 from fleetmap.errors import InputError
 from fleetmap.geodesy import UtmGrid
 from fleetmap.geometry import so3_exp
-from fleetmap.gnss import CONSUMER, GNSS_ERROR_MODELS, RTK, antenna_positions_m, fix_stamps_ns, sample_fixes
+from fleetmap.gnss import (
+    CONSUMER,
+    GNSS_ERROR_MODELS,
+    RTK,
+    antenna_positions_m,
+    fix_stamps_ns,
+    sample_fixes,
+    sample_outliers_enu_m,
+)
 from fleetmap.trajectory import Trajectory
 
 T0_NS = 1_700_000_000_000_000_000
@@ -170,3 +178,42 @@ def test_a_gap_removes_its_fixes_and_leaves_the_others_as_they_were():
     removed = sorted((stamp - T0_NS) // 1_000_000 for stamp in whole.keys() - gap.keys())
     assert removed == [2037, 3037, 4037, 5037, 6037]
     assert all(whole[stamp] == gap[stamp] for stamp in gap)
+
+
+class TestOutliers:
+    def test_a_fifth_of_the_fixes_is_far_off_and_says_that_it_is_good(self):
+        reference = straight_drive(1000.0)
+        fixes = sample_fixes(reference, RTK, interval_s=1.0, outlier_ratio=0.2, seed=1)
+        distances_m = np.linalg.norm(enu_errors(reference, fixes), axis=1)
+        far = distances_m > 1.0
+        assert far.sum() == round(0.2 * len(fixes))
+        assert 4.7 < distances_m[far].min() < 7.0
+        assert 48.0 < distances_m[far].max() < 50.3
+        assert distances_m[far].mean() == pytest.approx(27.5, abs=3.0)
+        assert all(fix.covariance_enu_m2 == pytest.approx(np.eye(3) * 0.05**2) for fix in fixes)
+
+    def test_the_other_fixes_stay_as_they_are_without_outliers_and_fewer_are_among_more(self):
+        clean, few, many = (
+            positions(sample_fixes(cubic_drive(), CONSUMER, outlier_ratio=ratio, seed=7))
+            for ratio in (0.0, 0.1, 0.3)
+        )
+        moved_by_few, moved_by_many = ({s for s in clean if clean[s] != other[s]} for other in (few, many))
+        assert (len(moved_by_few), len(moved_by_many)) == (round(0.1 * len(clean)), round(0.3 * len(clean)))
+        assert moved_by_few < moved_by_many
+        assert all(few[stamp] == many[stamp] for stamp in moved_by_few)
+
+    def test_they_lie_in_all_directions_alike(self):
+        outliers = sample_outliers_enu_m(4000, 1.0, seed=3)
+        directions = outliers / np.linalg.norm(outliers, axis=1, keepdims=True)
+        assert np.abs(directions.mean(axis=0)).max() < 0.04
+        assert (directions**2).mean(axis=0) == pytest.approx([1 / 3] * 3, abs=0.02)
+
+    def test_another_seed_chooses_others(self):
+        first, again, other = (sample_outliers_enu_m(100, 0.2, seed) for seed in (1, 1, 2))
+        np.testing.assert_array_equal(first, again)
+        assert 5 < ((first != 0) & (other == 0)).any(axis=1).sum() <= 20
+
+    @pytest.mark.parametrize("ratio", [-0.1, 1.1, float("nan")])
+    def test_what_is_no_share_is_refused(self, ratio):
+        with pytest.raises(InputError, match="share of 0 to 1"):
+            sample_fixes(cubic_drive(), RTK, outlier_ratio=ratio)

@@ -56,6 +56,12 @@ def _gnss_options(command: Callable[..., None]) -> Callable[..., None]:
         click.option("--gnss-interval-s", type=float, help="Seconds between fixes.  [default: 0.1]"),
         click.option("--gnss-gap", type=Gap(), help="A stretch without fixes, in seconds since the first image."),
         click.option(
+            "--gnss-outliers",
+            type=float,
+            metavar="RATIO",
+            help="This share of the fixes is 5 to 50 m off, while their covariance says that they are good.",
+        ),
+        click.option(
             "--antenna-in-camera",
             type=XYZ,
             help="The antenna in metres right, down, forward of the camera.  [default: the camera centre]",
@@ -306,14 +312,17 @@ def _simulated_gnss(
     gnss_error: str | None,
     gnss_interval_s: float | None,
     gnss_gap: tuple[float, float] | None,
+    gnss_outliers: float | None,
     antenna_in_camera: tuple[float, float, float] | None,
     seed: int,
 ) -> SimulatedGnss | None:
     if gnss_error is not None:
         interval_s = 0.1 if gnss_interval_s is None else gnss_interval_s
-        return SimulatedGnss(gnss_error, interval_s, gnss_gap, antenna_in_camera, seed)
-    if any(option is not None for option in (gnss_interval_s, gnss_gap, antenna_in_camera)):
-        raise click.UsageError("--gnss-interval-s, --gnss-gap and --antenna-in-camera need --gnss-error")
+        return SimulatedGnss(gnss_error, interval_s, gnss_gap, antenna_in_camera, seed, gnss_outliers or 0.0)
+    if any(option is not None for option in (gnss_interval_s, gnss_gap, gnss_outliers, antenna_in_camera)):
+        raise click.UsageError(
+            "--gnss-interval-s, --gnss-gap, --gnss-outliers and --antenna-in-camera need --gnss-error"
+        )
     return None
 
 

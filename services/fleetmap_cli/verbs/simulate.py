@@ -117,6 +117,13 @@ class _SensorList(click.ParamType[frozenset[str]]):
     "--gnss-clock-offset-s", default=0.0, show_default=True, help="How late the stamps of the fixes are."
 )
 @click.option(
+    "--gnss-outliers",
+    default=0.0,
+    show_default=True,
+    metavar="RATIO",
+    help="This share of the fixes is 5 to 50 m off, while their covariance says that they are good.",
+)
+@click.option(
     "--antenna-offset",
     type=XYZ,
     default="0,0,0",
@@ -190,6 +197,7 @@ def _scenario(options: dict[str, Any]) -> Scenario:
         gnss_interval_s=options["gnss_interval_s"],
         gnss_gap_s=options["gnss_gap"],
         gnss_clock_offset_s=options["gnss_clock_offset_s"],
+        gnss_outlier_ratio=options["gnss_outliers"],
         antenna_in_cam_m=(-left_m + 0.0, -up_m + 0.0, forward_m),
         sensors=Sensors(
             IMU_ERROR_MODELS[options["imu_model"]] if "imu" in on_board else None,

@@ -61,6 +61,7 @@ class SimulatedGnss:
     gap_s: tuple[float, float] | None = None
     antenna_in_camera_m: tuple[float, float, float] | None = None  # None: the antenna is the camera centre
     seed: int = 0
+    outlier_ratio: float = 0.0
 
 
 def conclude(
@@ -96,6 +97,7 @@ def simulated_fixes(reference: Trajectory, gnss: SimulatedGnss) -> list[GnssFix]
         interval_s=gnss.interval_s,
         gap_s=gnss.gap_s,
         antenna_in_cam_m=gnss.antenna_in_camera_m or (0.0, 0.0, 0.0),
+        outlier_ratio=gnss.outlier_ratio,
         seed=gnss.seed,
     )
 

@@ -12,7 +12,7 @@ from fleetmap.drive import GnssFix
 from fleetmap.errors import InputError
 from fleetmap.geodesy import UtmGrid
 from fleetmap.geometry import Pose
-from fleetmap.gnss import GNSS_ERROR_MODELS, fix_stamps_ns, fixes_at, in_gap
+from fleetmap.gnss import GNSS_ERROR_MODELS, fix_stamps_ns, fixes_at, in_gap, require_outlier_ratio
 from fleetmap.simulation.motion import Motion
 from fleetmap.simulation.world import World
 
@@ -30,6 +30,7 @@ class Receiver:
     interval_s: float = 0.1
     gap_s: tuple[float, float] | None = None  # start, since the first image, and length of a stretch without fixes
     clock_offset_s: float = 0.0  # its fixes' stamps are late by this
+    outlier_ratio: float = 0.0  # of the fixes, which are 5 to 50 m off and do not know it
 
     def __post_init__(self) -> None:
         if self.model not in GNSS_ERROR_MODELS:
@@ -42,6 +43,7 @@ class Receiver:
             )
         if not abs(self.clock_offset_s) <= 10.0:
             raise InputError(f"a GNSS clock that is {self.clock_offset_s} s off makes no sense; give at most 10 s")
+        require_outlier_ratio(self.outlier_ratio)
 
     def fixes(
         self, world: World, motion: Motion, image_stamps_ns: NDArray[np.int64], cam_from_antenna: Pose, seed: int
@@ -54,7 +56,8 @@ class Receiver:
         stamps_ns = fix_stamps_ns(image_stamps_ns, self.interval_s)
         truth = motion.trajectory(stamps_ns)
         antennas_m = truth.positions_m + truth.rotations @ cam_from_antenna.translation_m
-        fixes = fixes_at(UtmGrid(truth.epsg), stamps_ns, antennas_m, GNSS_ERROR_MODELS[self.model], seed)
+        grid, model = UtmGrid(truth.epsg), GNSS_ERROR_MODELS[self.model]
+        fixes = fixes_at(grid, stamps_ns, antennas_m, model, seed, self.outlier_ratio)
         has_sky = ~_is_in_tunnel(world, world.anchor.map_from_utm(antennas_m))
         if self.gap_s is not None:
             start_ns = int(image_stamps_ns[0])

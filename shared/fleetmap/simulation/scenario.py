@@ -55,6 +55,7 @@ class Scenario:
     gnss_interval_s: float = 1.0
     gnss_gap_s: tuple[float, float] | None = None
     gnss_clock_offset_s: float = 0.0
+    gnss_outlier_ratio: float = 0.0
     antenna_in_cam_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     sensors: Sensors = field(default_factory=Sensors)
 
@@ -111,6 +112,7 @@ def simulate_scenario(scenario: Scenario) -> SimulatedDrive:
         gnss_interval_s=scenario.gnss_interval_s,
         gnss_gap_s=scenario.gnss_gap_s,
         gnss_clock_offset_s=scenario.gnss_clock_offset_s,
+        gnss_outlier_ratio=scenario.gnss_outlier_ratio,
         antenna_in_cam_m=scenario.antenna_in_cam_m,
         camera_height_m=scenario.camera_height_m,
         sensors=scenario.sensors,
@@ -132,7 +134,13 @@ def _require_sense(scenario: Scenario) -> None:
     require_readout(scenario.readout_s)
     UtmGrid.at(*scenario.site[:2])
     if scenario.gnss is not None:
-        Receiver(scenario.gnss, scenario.gnss_interval_s, scenario.gnss_gap_s, scenario.gnss_clock_offset_s)
+        Receiver(
+            scenario.gnss,
+            scenario.gnss_interval_s,
+            scenario.gnss_gap_s,
+            scenario.gnss_clock_offset_s,
+            scenario.gnss_outlier_ratio,
+        )
     if not 0.0 < scenario.length_m <= LONGEST_DRIVE_M:
         raise InputError(f"a drive of {scenario.length_m:g} m makes no sense; give 1 to {LONGEST_DRIVE_M:.0f} m")
     if not 0.0 <= scenario.start_m <= LONGEST_DRIVE_M:

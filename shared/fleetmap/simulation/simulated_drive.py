@@ -160,6 +160,7 @@ def simulate_drive(
     gnss_interval_s: float = 0.1,
     gnss_gap_s: tuple[float, float] | None = None,
     gnss_clock_offset_s: float = 0.0,
+    gnss_outlier_ratio: float = 0.0,
     antenna_in_cam_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
     camera_height_m: float = 1.65,
     sensors: Sensors | None = None,
@@ -179,6 +180,7 @@ def simulate_drive(
         gnss_interval_s: seconds between fixes.
         gnss_gap_s: start (seconds since the first image) and length of a stretch without fixes.
         gnss_clock_offset_s: how late the stamps of the fixes are.
+        gnss_outlier_ratio: the share of the fixes that are 5 to 50 m off and do not know it.
         antenna_in_cam_m: the antenna in the camera's frame.
         camera_height_m: above the road; other sensors hang on it.
         sensors: what else is on board.
@@ -187,7 +189,7 @@ def simulate_drive(
         name: what messages and provenance call the drive.
 
     Raises:
-        InputError: an unknown error model, or an interval, gap, offset or readout that makes no sense.
+        InputError: an unknown error model, or an interval, gap, offset, share or readout that makes no sense.
     """
     require_readout(readout_s)
     if isinstance(world, Street):
@@ -196,7 +198,7 @@ def simulate_drive(
     mounting = Mounting(camera_height_m, antenna_in_cam_m)
     fixes: list[GnssFix] = []
     if gnss is not None:
-        receiver = Receiver(gnss, gnss_interval_s, gnss_gap_s, gnss_clock_offset_s)
+        receiver = Receiver(gnss, gnss_interval_s, gnss_gap_s, gnss_clock_offset_s, gnss_outlier_ratio)
         fixes = receiver.fixes(world, motion, trajectory.stamps_ns, mounting.cam_from_antenna, seed)
     return SimulatedDrive(
         world,

@@ -41,6 +41,17 @@ def test_a_clock_that_is_late_shifts_stamps_and_nothing_else(world: World) -> No
     np.testing.assert_array_equal(_positions_m(world, right), _positions_m(world, late))
 
 
+def test_outliers_are_a_share_of_the_fixes_and_leave_the_others_alone(world: World) -> None:
+    world = replace(world, tunnels_m=())
+    motion = plan_motion(world, seed=2)
+    stamps_ns = image_stamps_ns(motion, 10.0)
+    right = Receiver("rtk", 0.1).fixes(world, motion, stamps_ns, _ANTENNA, 5)
+    wild = Receiver("rtk", 0.1, outlier_ratio=0.2).fixes(world, motion, stamps_ns, _ANTENNA, 5)
+    moved_m = np.linalg.norm(_positions_m(world, wild) - _positions_m(world, right), axis=1)
+    assert (moved_m > 0.0).sum() == round(0.2 * len(right))
+    assert 5.0 - 0.01 < moved_m[moved_m > 0.0].min() < moved_m.max() < 50.0 + 0.1
+
+
 def test_fixes_between_two_far_apart_images_are_on_the_true_road(world: World) -> None:
     motion = plan_motion(replace(world, tunnels_m=()), seed=2)
     stamps_ns = image_stamps_ns(motion, 0.5)
@@ -70,6 +81,7 @@ def test_there_are_no_fixes_in_a_tunnel_and_the_others_stay_the_same(world: Worl
         ({"model": "perfect"}, "no GNSS error model 'perfect'"),
         ({"clock_offset_s": float("nan")}, "clock"),
         ({"clock_offset_s": 3600.0}, "clock"),
+        ({"outlier_ratio": -0.2}, "share of 0 to 1"),
     ],
 )
 def test_a_receiver_that_makes_no_sense_is_refused(receiver: dict[str, object], complaint: str) -> None:
