@@ -217,3 +217,22 @@ def test_an_existing_recording_is_kept_unless_forced(fleetmap: Run, tmp_path: Pa
     assert out.read_bytes() == b"precious"
     assert fleetmap("simulate", out, *short, "--force")[0] == 0
     assert open_drive(out).frame_count > 10
+
+
+def test_images_of_the_same_drive_are_taken_over_and_the_bytes_are_the_same(
+    fleetmap: Run, tmp_path: Path, short: list[object]
+) -> None:
+    assert fleetmap("simulate", tmp_path / "rtk.mcap", *short)[0] == 0
+    other = [*short, "--gnss", "consumer", "--gnss-interval-s", 0.2]
+    assert fleetmap("simulate", tmp_path / "rendered.mcap", *other)[0] == 0
+    code, _, stderr = fleetmap("simulate", tmp_path / "taken.mcap", *other, "--images-from", tmp_path / "rtk.mcap")
+    assert code == 0, stderr
+    assert (tmp_path / "taken.mcap").read_bytes() == (tmp_path / "rendered.mcap").read_bytes()
+    assert len(open_drive(tmp_path / "taken.mcap").gnss_fixes()) > len(
+        open_drive(tmp_path / "rtk.mcap").gnss_fixes()
+    )
+    refused = ["--look", "dusk", "--images-from", tmp_path / "rtk.mcap"]
+    code, stdout, stderr = fleetmap("simulate", tmp_path / "dusk.mcap", *short, *refused)
+    assert (code, stdout) == (2, "")
+    assert "does not show the drive that these options make: its image 0 looks different" in stderr
+    assert list(tmp_path.glob("dusk.*")) == []

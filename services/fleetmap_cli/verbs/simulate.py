@@ -144,8 +144,15 @@ class _SensorList(click.ParamType[frozenset[str]]):
     type=click.Choice(list(IMU_ERROR_MODELS)),
     help="How the IMU errs.",
 )
+@click.option(
+    "--images-from",
+    type=_FILE,
+    metavar="OTHER.mcap",
+    help="Take the images over from a recording of the same drive with another receiver, which saves rendering "
+    "them; stamps and every 20th image are checked. The bytes are the same with and without.",
+)
 @click.option("--force", is_flag=True, help="Replace an existing recording.")
-def simulate(output: Path, force: bool, **options: Any) -> None:
+def simulate(output: Path, images_from: Path | None, force: bool, **options: Any) -> None:
     """Simulate a drive and write OUT.mcap (ROS 2 messages), and apart from it the truth: OUT.reference.tum.
 
     Equal options give equal bytes. Where the world has ArUco markers, OUT.markers.json says where they are.
@@ -163,7 +170,7 @@ def simulate(output: Path, force: bool, **options: Any) -> None:
     """
     refuse_existing(output, force)
     drive = simulate_scenario(_scenario(options))
-    recorded = record_drive(drive, output, force=force, progress=True)
+    recorded = record_drive(drive, output, force=force, progress=True, images_from=images_from)
     circuit = " around a circuit" if drive.world.is_closed else ""
     apart = [f"reference in {recorded.reference}"]
     if recorded.markers is not None:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
+from itertools import repeat
 from pathlib import Path
 
 import numpy as np
@@ -15,12 +16,12 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from fleetmap.drives.conversion import reference_path
-from fleetmap.drives.image_codec import encode_image
 from fleetmap.drives.ros2_writer import DriveWriter
 from fleetmap.files import atomic_path, refuse_existing, write_text_atomically
 from fleetmap.geometry import quat_xyzw_from_rotations
 from fleetmap.simulation.mounting import ANTENNA_FRAME, CAMERA_FRAME, IMU_FRAME, LIDAR_FRAME, VEHICLE_FRAME
 from fleetmap.simulation.parallel import render_many
+from fleetmap.simulation.rendered_images import jpeg_of, rendered_images
 from fleetmap.simulation.simulated_drive import SimulatedDrive
 from fleetmap.simulation.world import World
 from fleetmap.trajectory import write_trajectory
@@ -47,7 +48,13 @@ class _Message:
 
 
 def record_drive(
-    drive: SimulatedDrive, path: Path, *, force: bool = False, progress: bool = False, workers: int | None = None
+    drive: SimulatedDrive,
+    path: Path,
+    *,
+    force: bool = False,
+    progress: bool = False,
+    workers: int | None = None,
+    images_from: Path | None = None,
 ) -> Recorded:
     """Write a simulated drive as MCAP, and its truth beside it: ``survey.mcap``, ``survey.reference.tum``.
 
@@ -60,9 +67,12 @@ def record_drive(
         force: replace an existing recording.
         progress: show a bar on stderr.
         workers: threads that render; by default as many as this process has cores.
+        images_from: a recording of this very drive whose images are taken over, which saves rendering them.
 
     Raises:
         OutputExistsError: the recording is there already and ``force`` is not given.
+        DriveError: the other recording cannot be read.
+        InputError: the other recording shows another drive; stamps are compared, and each 20th image.
         StorageError: the disk is full or refuses.
     """
     refuse_existing(path, force)
@@ -76,7 +86,7 @@ def record_drive(
         hidden = None if progress else True  # None: where stderr is a file or a pipe
         images = tqdm(desc=f"render {path.name}", total=drive.frame_count, unit="image", disable=hidden)
         with images:
-            for message in _messages(drive, workers):
+            for message in _messages(drive, workers, images_from):
                 message.write(writer)
                 images.update(message.is_image)
     if not drive.world.markers:
@@ -131,7 +141,7 @@ def _write_mounting(writer: DriveWriter, drive: SimulatedDrive) -> None:
             writer.write_static_transform(CAMERA_FRAME, frame, cam_from_sensor)
 
 
-def _messages(drive: SimulatedDrive, workers: int | None) -> Iterator[_Message]:
+def _messages(drive: SimulatedDrive, workers: int | None, images_from: Path | None) -> Iterator[_Message]:
     """Everything a drive records, in time order."""
     antenna_frame = ANTENNA_FRAME if any(drive.mounting.antenna_in_cam_m) else CAMERA_FRAME
     fixes = (
@@ -146,24 +156,27 @@ def _messages(drive: SimulatedDrive, workers: int | None) -> Iterator[_Message]:
         _Message(speed.stamp_ns, partial(DriveWriter.write_wheel_speed, speed=speed, frame_id=VEHICLE_FRAME))
         for speed in drive.wheel_speeds()
     )
-    rendered = render_many(lambda make: make(), _rendering_jobs(drive), workers)
+    rendered = render_many(lambda make: make(), _rendering_jobs(drive, images_from), workers)
     return heapq.merge(fixes, imu, wheels, rendered, key=lambda message: message.stamp_ns)
 
 
-def _rendering_jobs(drive: SimulatedDrive) -> Iterator[Callable[[], _Message]]:
+def _rendering_jobs(drive: SimulatedDrive, images_from: Path | None) -> Iterator[Callable[[], _Message]]:
     """What takes time to make, in time order."""
     stamps_ns = drive.trajectory.stamps_ns.tolist()
-    images = ((stamp_ns, partial(_image, drive, index)) for index, stamp_ns in enumerate(stamps_ns))
+    known = repeat(None) if images_from is None else rendered_images(images_from, drive)
+    images = (
+        (stamp_ns, partial(_image, drive, index, jpeg, images_from))
+        for index, (stamp_ns, jpeg) in enumerate(zip(stamps_ns, known, strict=False))
+    )
     depths = ((stamp_ns, partial(_depth, drive, index)) for index, stamp_ns in enumerate(stamps_ns))
     scans = ((stamp_ns, partial(_scan, drive, stamp_ns)) for stamp_ns in drive.scan_stamps_ns())
     jobs = heapq.merge(images, depths if drive.sensors.depth else (), scans, key=lambda job: job[0])
     return (make for _, make in jobs)
 
 
-def _image(drive: SimulatedDrive, index: int) -> _Message:
-    frame = drive.frame(index)
-    jpeg = encode_image(frame.image)
-    return _Message(frame.stamp_ns, lambda writer: writer.write_jpeg(frame.stamp_ns, jpeg), is_image=True)
+def _image(drive: SimulatedDrive, index: int, rendered: bytes | None, images_from: Path | None) -> _Message:
+    stamp_ns, jpeg = int(drive.trajectory.stamps_ns[index]), jpeg_of(drive, index, rendered, images_from)
+    return _Message(stamp_ns, lambda writer: writer.write_jpeg(stamp_ns, jpeg), is_image=True)
 
 
 def _depth(drive: SimulatedDrive, index: int) -> _Message:

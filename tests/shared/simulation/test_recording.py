@@ -30,6 +30,7 @@ from fleetmap.simulation.world import build_world
 from fleetmap.trajectory import read_trajectory
 
 _ANTENNA = (0.3, -0.8, -1.2)
+SMALL = Camera(96, 64, 60.0, 60.0, 47.5, 31.5)
 
 
 def test_a_recording_holds_camera_images_fixes_and_antenna(street: Street, camera: Camera, tmp_path: Path) -> None:
@@ -223,3 +224,30 @@ def test_an_interrupted_recording_leaves_nothing(
     with pytest.raises(KeyboardInterrupt):
         record_drive(drive, tmp_path / "a.mcap")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_images_are_taken_over_from_a_recording_of_the_same_drive_only(street: Street, tmp_path: Path) -> None:
+    settings = {"camera": SMALL, "look": Look(seed=9), "seed": 7}
+    trajectory = drive_along(street, end_m=20.0, seed=3)
+    drive = simulate_drive(street, trajectory=trajectory, **settings)
+    record_drive(drive, tmp_path / "first.mcap")
+    without_fixes = replace(drive, fixes=())
+    record_drive(without_fixes, tmp_path / "rendered.mcap")
+    record_drive(without_fixes, tmp_path / "taken.mcap", images_from=tmp_path / "first.mcap")
+    assert (tmp_path / "taken.mcap").read_bytes() == (tmp_path / "rendered.mcap").read_bytes()
+
+    ends_elsewhere = trajectory.positions_m.copy()
+    ends_elsewhere[-1, 0] += 0.3
+    shifted = replace(trajectory, stamps_ns=trajectory.stamps_ns + 1)
+    others = {
+        "its image 0 looks different": replace(drive, look=Look(seed=10)),
+        f"its image {len(trajectory) - 1} looks different": replace(
+            drive, trajectory=replace(trajectory, positions_m=ends_elsewhere)
+        ),
+        "its images have other stamps": replace(drive, trajectory=shifted),
+        "it has not": simulate_drive(street, trajectory=drive_along(street, end_m=10.0, seed=3), **settings),
+    }
+    for reason, other in others.items():
+        with pytest.raises(InputError, match=f"does not show the drive that these options make: {reason}"):
+            record_drive(other, tmp_path / "other.mcap", images_from=tmp_path / "first.mcap")
+    assert list(tmp_path.glob("other.*")) == []
