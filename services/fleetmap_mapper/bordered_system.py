@@ -52,75 +52,101 @@ class BorderedStep:
     poses: Array  # (N,) tangents of the poses, then the other variables'
     points: Array  # (P, 3)
     information: Array  # (C, C) of the calibration, with its prior, everything else free
-    gradient: Array  # (C,) of the cost once everything else is free
     poses_by_calibration: Array  # (N, C) how the poses follow
     points_by_calibration: Array  # (P, 3, C) how the points follow
 
 
-def solve_bordered(
-    images: LinearisedImages, rest: LinearisedRest, change: Array, damping: float
-) -> BorderedStep:
+@dataclass(frozen=True)
+class _WithoutPoints:
+    """The system once the points are eliminated, and what brings them back."""
+
+    S_pp: sp.csc_matrix  # (6 K, 6 K)
+    S_pc: Array  # (6 K, C)
+    b_p: Array  # (6 K,)
+    S_cc: Array  # (C, C)
+    b_c: Array  # (C,)
+    V_inverse: Array  # (P, 3, 3)
+    gl: Array  # (P, 3)
+    W: Array  # (M, 6, 3) pose by point
+    Wc: Array  # (P, C, 3) calibration by point
+    point_index: IntArray  # (M,)
+
+
+def solve_bordered(images: LinearisedImages, rest: LinearisedRest, change: Array, damping: float) -> BorderedStep:
     """One damped step; ``change`` (C,) is where the calibration stands, in sigmas of its prior."""
-    by_pose, by_point, by_calibration = images.by_pose, images.by_point, images.by_calibration
-    count = len(change)
-    k, r = images.keyframe_index, images.residuals
-    points = len(images.starts) - 1
-    point_index = np.repeat(np.arange(points), np.diff(images.starts))
-    V = _summed(np.einsum("mri,mrj->mij", by_point, by_point), point_index, points)
-    diagonal = np.einsum("pii->pi", V)
-    diagonal *= 1.0 + damping
-    diagonal += 1e-12
-    V_inverse = np.linalg.inv(V)
-    gl = _summed(np.einsum("mri,mr->mi", by_point, r), point_index, points)
-    W = np.einsum("mri,mrj->mij", by_pose, by_point)  # (M, 6, 3)
-    Wc = _summed(np.einsum("mri,mrj->mij", by_calibration, by_point), point_index, points)  # (P, C, 3)
-    U = _summed(np.einsum("mri,mrj->mij", by_pose, by_pose), k, images.keyframes)
-    E = _summed(np.einsum("mri,mrj->mij", by_pose, by_calibration), k, images.keyframes)  # (K, 6, C)
-    gp = _summed(np.einsum("mri,mr->mi", by_pose, r), k, images.keyframes)
-    C = np.einsum("mri,mrj->ij", by_calibration, by_calibration)
-    gc = np.einsum("mri,mr->i", by_calibration, r) + change
-
-    WV = np.einsum("mij,mjk->mik", W, V_inverse[point_index])  # (M, 6, 3)
-    S_pc = E - _summed(np.einsum("mij,mcj->mic", WV, Wc[point_index]), k, images.keyframes)
-    b_p = gp - _summed(np.einsum("mij,mj->mi", WV, gl[point_index]), k, images.keyframes)
-    WcV = np.einsum("pcj,pjk->pck", Wc, V_inverse)
-    S_cc = C - np.einsum("pcj,pdj->cd", WcV, Wc) + np.eye(count)
-    b_c = gc - np.einsum("pcj,pj->c", WcV, gl)
-
-    S_pp = _pose_system(U, W, WV, images, damping) if images.keyframes else sp.csc_matrix((0, 0))
-    size = rest.jacobian.shape[1]
-    S_pp = _enlarged(S_pp, size) + rest.jacobian.T @ rest.jacobian
+    reduced = _eliminate_points(images, damping)
+    S_pc, by_pose = _lengthened(reduced.S_pc, rest), _lengthened(reduced.b_p, rest)
+    b_p = by_pose + rest.jacobian.T @ rest.residuals
+    S_pp = _enlarged(reduced.S_pp, len(b_p)) + rest.jacobian.T @ rest.jacobian
     S_pp = (S_pp + sp.diags(damping * S_pp.diagonal() + 1e-9)).tocsc()
-    right = np.zeros((size, count + 1))
-    right[: 6 * images.keyframes, :count] = S_pc.reshape(-1, count)
-    right[: 6 * images.keyframes, count] = b_p.ravel()
-    right[:, count] += rest.jacobian.T @ rest.residuals
     solver = splu(S_pp, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    solved = solver.solve(right)
-    follow, alone = solved[:, :count], solved[:, count]
-    information = S_cc - right[:, :count].T @ follow
-    gradient = b_c - right[:, :count].T @ alone
-    dc = -np.linalg.solve(information, gradient)
-    dp = -alone - follow @ dc
+    solved = solver.solve(np.column_stack([S_pc, b_p]))
+    poses_follow, alone = -solved[:, :-1], -solved[:, -1]
 
-    per_keyframe = follow[: 6 * images.keyframes].reshape(-1, 6, count)
-    point_by_pose = _summed(np.einsum("mij,mic->mjc", W, per_keyframe[k]), point_index, points)
-    points_follow = np.einsum("pij,pjc->pic", V_inverse, Wc.transpose(0, 2, 1) - point_by_pose)
-    moved = _summed(
-        np.einsum("mij,mi->mj", W, dp[: 6 * images.keyframes].reshape(-1, 6)[k]), point_index, points
+    information = reduced.S_cc + np.eye(len(change)) + S_pc.T @ poses_follow
+    dc = -np.linalg.solve(information, reduced.b_c + change + S_pc.T @ alone)
+    dp = alone + poses_follow @ dc
+    of_poses = _by_observation(np.column_stack([poses_follow, dp]), images)  # (M, 6, C + 1)
+    carried = sum_rows(_products(reduced.W, of_poses), reduced.point_index, len(reduced.gl))
+    points_follow = -reduced.V_inverse @ (reduced.Wc.transpose(0, 2, 1) + carried[:, :, :-1])
+    dl = -reduced.V_inverse @ (reduced.gl + reduced.Wc.transpose(0, 2, 1) @ dc + carried[:, :, -1])[:, :, None]
+    return BorderedStep(dc, dp, dl[:, :, 0], information, poses_follow, points_follow)
+
+
+def _eliminate_points(images: LinearisedImages, damping: float) -> _WithoutPoints:
+    by_pose, by_point, by_calibration = images.by_pose, images.by_point, images.by_calibration
+    r, K, P = images.residuals[:, :, None], images.keyframes, len(images.starts) - 1
+    point_index, k = np.repeat(np.arange(P), np.diff(images.starts)), images.keyframe_index
+    V = sum_rows(_products(by_point, by_point), point_index, P)
+    V += np.eye(3) * (damping * V + 1e-12)
+    V_inverse = np.linalg.inv(V)
+    gl = sum_rows(_products(by_point, r), point_index, P)
+    W = _products(by_pose, by_point)
+    Wc = sum_rows(_products(by_calibration, by_point), point_index, P)
+    WV, WcV = W @ V_inverse[point_index], Wc @ V_inverse
+    S_pc = _products(by_pose, by_calibration) - WV @ Wc.transpose(0, 2, 1)[point_index]
+    b_p = _products(by_pose, r) - WV @ gl[point_index]
+    flat = by_calibration.reshape(-1, by_calibration.shape[2])
+    U = sum_rows(_products(by_pose, by_pose), k, K)
+    return _WithoutPoints(
+        _pose_system(U, W, WV, images),
+        sum_rows(S_pc, k, K).reshape(6 * K, -1),
+        sum_rows(b_p, k, K).ravel(),
+        flat.T @ flat - (WcV @ Wc.transpose(0, 2, 1)).sum(axis=0),
+        flat.T @ images.residuals.ravel() - (WcV @ gl).sum(axis=0)[:, 0],
+        V_inverse,
+        gl[:, :, 0],
+        W,
+        Wc,
+        point_index,
     )
-    dl = -np.einsum("pij,pj->pi", V_inverse, gl + moved + np.einsum("pcj,c->pj", Wc, dc))
-    return BorderedStep(dc, dp, dl, information, gradient, -follow, -points_follow)
 
 
-def _summed(values: Array, index: IntArray, count: int) -> Array:
+def _products(a: Array, b: Array) -> Array:
+    """a^T b of every row: (M, i, j) from (M, n, i) and (M, n, j)."""
+    return np.asarray(a.transpose(0, 2, 1) @ b)
+
+
+def _by_observation(of_poses: Array, images: LinearisedImages) -> Array:
+    """Rows (N, C) of the poses' tangents as (M, 6, C), those of each observation's keyframe."""
+    per_keyframe = of_poses[: 6 * images.keyframes].reshape(images.keyframes, 6, -1)
+    return np.asarray(per_keyframe[images.keyframe_index])
+
+
+def _lengthened(of_poses: Array, rest: LinearisedRest) -> Array:
+    """With zeros for the variables after the poses."""
+    more = rest.jacobian.shape[1] - len(of_poses)
+    return np.concatenate([of_poses, np.zeros((more, *of_poses.shape[1:]))])
+
+
+def sum_rows(values: Array, index: IntArray, count: int) -> Array:
     """Sums (count, ...) of the rows of ``values`` (M, ...) by their index."""
     flat = values.reshape(len(values), -1)
     picker = sp.csr_matrix((np.ones(len(index)), (index, np.arange(len(index)))), shape=(count, len(index)))
     return np.asarray(picker @ flat).reshape(count, *values.shape[1:])
 
 
-def _pose_system(U: Array, W: Array, WV: Array, images: LinearisedImages, damping: float) -> sp.csc_matrix:
+def _pose_system(U: Array, W: Array, WV: Array, images: LinearisedImages) -> sp.csc_matrix:
     """The reduced camera system (6 K, 6 K), symmetric and sparse: keyframes that share no point have no block."""
     first, second = _pairs(images.keyframe_index, images.starts)
     places, slots = np.unique(first * images.keyframes + second, return_inverse=True)

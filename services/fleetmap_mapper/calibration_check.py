@@ -1,0 +1,179 @@
+"""Does the drive contradict the recorded calibration? A few Gauss-Newton steps from the finished map tell.
+
+Poses and points are free in those steps, so what they can absorb is not held against the calibration. The
+covariance is the sandwich estimate of J. White, "Maximum likelihood estimation of misspecified models", 1982,
+clustered over stretches of the drive (Liang and Zeger, 1986): reprojection errors go together along a track and
+between neighbouring tracks, and counting every one of them as a witness would make anything significant.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.camera import Camera
+from fleetmap_mapper.bordered_system import (
+    BorderedStep,
+    LinearisedImages,
+    LinearisedRest,
+    sum_rows,
+    solve_bordered,
+)
+from fleetmap_mapper.calibrated_graph import CalibratedGraph
+from fleetmap_mapper.calibration_parameters import (
+    CENTRE,
+    FOCAL,
+    LENS,
+    CalibrationPrior,
+    border_points,
+    calibration_prior,
+)
+from fleetmap_mapper.calibration_refinement import optimise
+from fleetmap_mapper.global_adjustment import GlobalProblem
+from fleetmap_mapper.settings import CalibrationGroup
+
+Array = NDArray[np.float64]
+
+_STEPS = 4
+_DAMPING = 1e-8  # the free directions of a map without fixes say nothing about the calibration
+_MAX_OBSERVATIONS = 40_000  # more landmarks than that are thinned out: seconds, and as clear an answer
+_CLUSTERS = 20  # stretches of the drive that count as independent witnesses
+
+
+@dataclass(frozen=True)
+class Disagreement:
+    """One part of the calibration: how far the drive's own estimate lies from the recorded one."""
+
+    sigmas: float  # how clear
+    border_px: float  # how large, in pixels at the image border
+
+
+@dataclass(frozen=True)
+class CalibrationEstimate:
+    """The calibration that fits the drive best, near the recorded one, and how well the drive knows it."""
+
+    recorded: Camera
+    fitted: Camera
+    focal_sigma_px: float
+    centre_sigma_px: tuple[float, float]
+    distortion_sigma: tuple[float, ...]
+    focal: Disagreement
+    centre: Disagreement
+    lens: Disagreement
+
+
+def estimate_calibration(
+    problem: GlobalProblem, settings: CalibrationGroup, recorded: Camera | None = None
+) -> CalibrationEstimate:
+    """The drive's own calibration from a finished map, against ``recorded`` (default: the one it was made with)."""
+    prior = calibration_prior(recorded or problem.camera, settings)
+    graph = CalibratedGraph(_thinned(problem), prior)
+    state, _ = optimise(graph, _STEPS)
+    images, rest = graph.linearised(state)
+    step = solve_bordered(images, rest, state.change, _DAMPING)
+    return _judged(prior, state.change, _covariance(images, rest, step))
+
+
+def calibration_remarks(estimate: CalibrationEstimate, settings: CalibrationGroup) -> list[str]:
+    """One line for each part of the recorded calibration that the drive contradicts."""
+    recorded, fitted, found = estimate.recorded, estimate.fitted, []
+
+    def matters(part: Disagreement) -> bool:
+        return part.sigmas > settings.warn_sigmas and part.border_px > settings.warn_border_px
+
+    if matters(estimate.focal):
+        found.append(
+            f"the recorded focal length {_focal_px(recorded):.1f} px disagrees with the drive: "
+            f"{_focal_px(fitted):.1f} +- {estimate.focal_sigma_px:.1f} px fits"
+        )
+    if matters(estimate.centre):
+        found.append(
+            f"the recorded image centre ({recorded.cx_px:.1f}, {recorded.cy_px:.1f}) px disagrees with the drive: "
+            f"({fitted.cx_px:.1f}, {fitted.cy_px:.1f}) +- "
+            f"({estimate.centre_sigma_px[0]:.1f}, {estimate.centre_sigma_px[1]:.1f}) px fits"
+        )
+    if matters(estimate.lens):
+        coefficients = " ".join(f"{k:.4f}" for k in fitted.distortion)
+        found.append(
+            f"the recorded lens distortion disagrees with the drive by {estimate.lens.border_px:.1f} px at the "
+            f"image border: {fitted.distortion_model} {coefficients} fits"
+        )
+    return [f"{line}; recalibrate, or map with --refine-calibration" for line in found]
+
+
+def _judged(prior: CalibrationPrior, change: Array, covariance: Array) -> CalibrationEstimate:
+    recorded, fitted = prior.recorded, prior.camera(change)
+    sigmas = np.sqrt(np.diag(covariance)) * prior.sigmas
+    border = recorded.normalise(border_points(recorded))
+    by_change = prior.pixel_jacobian(recorded, border)  # (B, 2, C)
+    return CalibrationEstimate(
+        recorded,
+        fitted,
+        float(sigmas[0] * _focal_px(fitted)),
+        (float(sigmas[2]), float(sigmas[3])),
+        tuple(sigmas[LENS].tolist()),
+        *(_disagreement(by_change[:, :, part], change[part], covariance[part, part]) for part in (FOCAL, CENTRE)),
+        _disagreement(by_change[:, :, LENS], change[LENS], covariance[LENS, LENS]),
+    )
+
+
+def _disagreement(by_change: Array, change: Array, covariance: Array) -> Disagreement:
+    """At the border point where one part of the calibration shifts pixels most, and how sure that shift is."""
+    shifts = by_change @ change
+    lengths = np.linalg.norm(shifts, axis=1)
+    worst = int(np.argmax(lengths))
+    along = (shifts[worst] / max(lengths[worst], 1e-12)) @ by_change[worst]
+    sigma = float(np.sqrt(along @ covariance @ along))
+    return Disagreement(float(lengths[worst]) / max(sigma, 1e-12), float(lengths[worst]))
+
+
+def _covariance(images: LinearisedImages, rest: LinearisedRest, step: BorderedStep) -> Array:
+    """Of the calibration (C, C): the larger of the graph's own and the clustered sandwich."""
+    k, counts = images.keyframe_index, np.diff(images.starts)
+    point_index = np.repeat(np.arange(len(counts)), counts)
+    follow = step.poses_by_calibration[: 6 * images.keyframes].reshape(images.keyframes, 6, -1)
+    rows = images.by_calibration + images.by_pose @ follow[k]
+    rows += images.by_point @ step.points_by_calibration[point_index]
+    # A track's own point fits three of its 2 n errors away, whatever their sigma; what is left is too small.
+    left = 2.0 * counts / np.maximum(2.0 * counts - 3.0, 1.0)
+    scores = (images.residuals[:, None, :] @ rows)[:, 0] * left[point_index][:, None]
+    stretch = max(1, -(-images.keyframes // _CLUSTERS))
+    clusters = k[images.starts[:-1]] // stretch if len(counts) else np.zeros(0, np.int64)
+    by_cluster = sum_rows(scores, clusters[point_index], int(clusters.max(initial=0)) + 1)
+    by_rest = rest.jacobian @ step.poses_by_calibration
+    own = np.linalg.inv(step.information)
+    meat = by_cluster.T @ by_cluster + by_rest.T @ by_rest + np.eye(len(own))
+    sandwich = own @ meat @ own
+    sandwich *= len(by_cluster) / max(len(by_cluster) - 1, 1)
+    return _larger(own, sandwich)
+
+
+def _larger(a: Array, b: Array) -> Array:
+    """A covariance at least as large as both: a + (b - a) where that is positive."""
+    whiten = np.linalg.cholesky(a)
+    inner = np.linalg.solve(whiten, np.linalg.solve(whiten, b).T)
+    values, vectors = np.linalg.eigh(0.5 * (inner + inner.T))
+    stretched = whiten @ vectors
+    return np.asarray((stretched * np.maximum(values, 1.0)) @ stretched.T)
+
+
+def _thinned(problem: GlobalProblem) -> GlobalProblem:
+    """Every so manieth landmark of a large map."""
+    every = -(-len(problem.pixels) // _MAX_OBSERVATIONS)
+    if every <= 1:
+        return problem
+    kept = problem.point_index % every == 0
+    return replace(
+        problem,
+        points_m=problem.points_m[::every],
+        point_index=problem.point_index[kept] // every,
+        keyframe_index=problem.keyframe_index[kept],
+        pixels=problem.pixels[kept],
+        sigmas_px=problem.sigmas_px[kept],
+    )
+
+
+def _focal_px(camera: Camera) -> float:
+    return float(np.sqrt(camera.fx_px * camera.fy_px))

@@ -1,0 +1,72 @@
+"""The calibration refined in the UGBA: one Levenberg-Marquardt over calibration, poses, points and fixes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap_mapper.bordered_system import solve_bordered
+from fleetmap_mapper.calibrated_graph import CalibratedGraph, State
+from fleetmap_mapper.calibration_parameters import CalibrationPrior
+from fleetmap_mapper.global_adjustment import GlobalProblem
+
+Array = NDArray[np.float64]
+
+_MAX_STEPS = 50
+_MAX_DAMPING = 1e6
+_STOPPED = 1e-7  # relative decrease of the cost
+
+
+@dataclass(frozen=True)
+class Refined:
+    """The joint optimum."""
+
+    problem: GlobalProblem  # with the refined camera, its poses, points, undistorted pixels and their sigmas
+    initial_cost: float
+    cost: float
+
+
+def refine_calibration(problem: GlobalProblem, prior: CalibrationPrior) -> Refined:
+    """Move the calibration with everything else to the optimum of all observations, fixes and priors."""
+    graph = CalibratedGraph(problem, prior)
+    state, cost = optimise(graph, _MAX_STEPS)
+    return Refined(_renewed(problem, graph, state), graph.cost(graph.start), cost)
+
+
+def optimise(graph: CalibratedGraph, max_steps: int) -> tuple[State, float]:
+    """Levenberg-Marquardt from the graph's start: the state reached, and its cost."""
+    state, damping = graph.start, 1e-5
+    cost = graph.cost(state)
+    for _ in range(max_steps):
+        images, rest = graph.linearised(state)
+        while True:
+            moved = graph.moved(state, solve_bordered(images, rest, state.change, damping))
+            new_cost = graph.cost(moved)
+            if new_cost < cost:
+                break
+            damping *= 10.0
+            if damping > _MAX_DAMPING:
+                return state, cost
+        decrease, state, cost = cost - new_cost, moved, new_cost
+        damping = max(0.1 * damping, 1e-9)
+        if decrease < _STOPPED * cost:
+            break
+    return state, cost
+
+
+def _renewed(problem: GlobalProblem, graph: CalibratedGraph, state: State) -> GlobalProblem:
+    """The problem seen through the refined camera; a pixel it cannot undistort becomes NaN."""
+    camera = graph.camera(state)
+    seen = graph.observations
+    back = np.argsort(seen.order)
+    pixels = camera.undistort(seen.pixels[back])
+    return replace(
+        problem,
+        camera=camera,
+        poses=graph.poses(state),
+        points_m=state.points_m,
+        pixels=pixels,
+        sigmas_px=seen.sigmas_px[back] * camera.magnification(pixels),
+    )
