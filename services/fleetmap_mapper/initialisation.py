@@ -1,4 +1,4 @@
-"""The first map, from two views (Nister's five-point method in LO-RANSAC, from poselib).
+"""The first map, from two views.
 
 Raw parallax is fooled by rotation, so what counts is the angle between the rays of triangulated points.
 """
@@ -8,7 +8,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import poselib
 from numpy.typing import NDArray
 
 from fleetmap.camera import Camera
@@ -17,10 +16,12 @@ from fleetmap.vision.features import Features
 from fleetmap.vision.matching import match_descriptors
 from fleetmap_mapper.settings import MapperSettings
 from fleetmap_mapper.triangulation import is_consistent, parallax_rad, triangulate
+from fleetmap_mapper.two_view_motion import motion_of_least_turn, motion_of_most
 
 Array = NDArray[np.float64]
 _MAX_HAMMING, _RATIO = 64, 0.8
 _MIN_CONSISTENT = 0.6  # of all matches: moving traffic may own the rest
+_CLEARLY_MORE = 0.75  # a motion that turns less may explain so much fewer: the rest may ride on a car ahead
 _NOMINAL_DEPTH = 10.0  # median depth of the first map: its scale is free, this keeps numbers of order one
 
 
@@ -43,12 +44,10 @@ def map_from_two_views(
     camera: Camera, first: Features, second: Features, pairs: NDArray[np.int32], settings: MapperSettings
 ) -> TwoViewMap | None:
     """A first map, or None while the two views do not determine one."""
-    pixels_a, pixels_b = first.pixels[pairs[:, 0]], second.pixels[pairs[:, 1]]
-    first_from_second = _relative_pose(camera, pixels_a, pixels_b, settings.seed)
-    points = triangulate(camera, Pose.identity(), pixels_a, first_from_second, pixels_b)
-    consistent = is_consistent(
-        camera, Pose.identity(), points, pixels_a, first.sigmas_px[pairs[:, 0]]
-    ) & is_consistent(camera, first_from_second, points, pixels_b, second.sigmas_px[pairs[:, 1]])
+    pixels_a, sigmas_a = first.pixels[pairs[:, 0]], first.sigmas_px[pairs[:, 0]]
+    pixels_b, sigmas_b = second.pixels[pairs[:, 1]], second.sigmas_px[pairs[:, 1]]
+    first_from_second = _motion(camera, pixels_a, sigmas_a, pixels_b, sigmas_b, settings.seed)
+    points, consistent = _triangulated(camera, first_from_second, pixels_a, sigmas_a, pixels_b, sigmas_b)
     parallax = parallax_rad(points, np.zeros(3), first_from_second.translation_m)
     good = consistent & (parallax > settings.mapping.min_parallax_px / camera.fx_px)
     # Far matches show no parallax, but bear witness. To wait until most show some would be wrong: matches thin
@@ -64,14 +63,23 @@ def map_from_two_views(
     )
 
 
-def _relative_pose(camera: Camera, pixels_a: Array, pixels_b: Array, seed: int) -> Pose:
-    model = {
-        "model": "PINHOLE",
-        "width": camera.width_px,
-        "height": camera.height_px,
-        "params": [camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px],
-    }
-    second_from_first, _ = poselib.estimate_relative_pose(
-        pixels_a, pixels_b, model, model, {"max_epipolar_error": 1.5, "seed": seed}
-    )
-    return Pose(np.asarray(second_from_first.R), np.asarray(second_from_first.t)).inverse()
+def _motion(camera: Camera, pixels_a: Array, sigmas_a: Array, pixels_b: Array, sigmas_b: Array, seed: int) -> Pose:
+    """``first_from_second``, of unit length: the one that turns least, unless another explains clearly more."""
+    most = motion_of_most(camera, pixels_a, pixels_b, seed)
+    least = motion_of_least_turn(camera, pixels_a, pixels_b, seed)
+    explained = [
+        np.count_nonzero(_triangulated(camera, motion, pixels_a, sigmas_a, pixels_b, sigmas_b)[1])
+        for motion in (most, least, Pose(least.rotation, -least.translation_m))
+    ]
+    if max(explained[1:]) < _CLEARLY_MORE * explained[0]:
+        return most
+    return least if explained[1] > explained[2] else Pose(least.rotation, -least.translation_m)
+
+
+def _triangulated(
+    camera: Camera, first_from_second: Pose, pixels_a: Array, sigmas_a: Array, pixels_b: Array, sigmas_b: Array
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Points (n, 3) in the first camera's frame, and which of them both views believe."""
+    points = triangulate(camera, Pose.identity(), pixels_a, first_from_second, pixels_b)
+    consistent = is_consistent(camera, Pose.identity(), points, pixels_a, sigmas_a)
+    return points, consistent & is_consistent(camera, first_from_second, points, pixels_b, sigmas_b)

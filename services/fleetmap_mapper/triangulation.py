@@ -18,7 +18,7 @@ def triangulate(camera: Camera, world_from_a: Pose, pixels_a: Array, world_from_
     Source: Hartley & Sturm, "Triangulation", CVIU 1997, section 5.1; bundle adjustment refines them.
     Parallel rays give no point: NaN, or one that neither pixel believes.
     """
-    rays_a, rays_b = _rays(camera, world_from_a, pixels_a), _rays(camera, world_from_b, pixels_b)
+    rays_a, rays_b = rays_of(camera, world_from_a, pixels_a), rays_of(camera, world_from_b, pixels_b)
     baseline = world_from_b.translation_m - world_from_a.translation_m
     cos = (rays_a * rays_b).sum(axis=1)
     along_a, along_b = rays_a @ baseline, rays_b @ baseline
@@ -49,7 +49,7 @@ def is_consistent(
         return np.asarray(((predicted - pixels) ** 2).sum(axis=1) < CHI2_2DOF_95 * sigmas_px**2)
 
 
-def _rays(camera: Camera, world_from_cam: Pose, pixels: Array) -> Array:
+def rays_of(camera: Camera, world_from_cam: Pose, pixels: Array) -> Array:
     """Unit viewing rays (N, 3) in world of undistorted pixels (N, 2)."""
     x = (pixels[:, 0] - camera.cx_px) / camera.fx_px
     y = (pixels[:, 1] - camera.cy_px) / camera.fy_px
