@@ -72,7 +72,13 @@ def map_recording(
         created_ns=time.time_ns(),
     )
     manifest = write_package(
-        output, mapped.visual_map, map_id=identity, quality=mapped.quality, provenance=provenance, force=force
+        output,
+        mapped.visual_map,
+        map_id=identity,
+        quality=mapped.quality,
+        provenance=provenance,
+        road_quality=mapped.road_quality,
+        force=force,
     )
     if trajectory is not None:
         write_trajectory(trajectory, mapped.trajectory)

@@ -14,6 +14,7 @@ from fleetmap.vision.absolute_pose import refine_absolute_pose
 from fleetmap_mapper.georeferencing import GnssTrack, path_at_fixes
 from fleetmap_mapper.global_adjustment import FixTerm, GlobalProblem, adjust_globally
 from fleetmap_mapper.growing_map import GrowingMap
+from fleetmap_mapper.pose_covariances import position_covariances_m2
 from fleetmap_mapper.slam import PosedFrame
 from fleetmap_mapper.triangulation import CHI2_2DOF_95
 
@@ -38,6 +39,7 @@ class PlacedMap:
     feature_index: NDArray[np.int32]  # (M,) feature of the keyframe
     pixels: Array  # (M, 2) undistorted
     sigmas_px: Array  # (M,)
+    position_covariances_m2: Array | None = None  # (K, 3, 3) of the final graph; NaN where no fix determines it
 
 
 def place(growing: GrowingMap, map_from_vis: Sim3) -> PlacedMap:
@@ -100,7 +102,12 @@ def adjust_with_fixes(
         placed = without_outliers(replace(placed, poses=optimum.poses, points_m=optimum.points_m))
     before = np.array([k.vis_from_cam.translation_m for k in growing.keyframes])
     after = np.array([p.translation_m for p in placed.poses])
-    return replace(placed, map_from_vis=umeyama_alignment(before, after))
+    final = replace(problem, poses=optimum.poses, points_m=optimum.points_m)
+    return replace(
+        placed,
+        map_from_vis=umeyama_alignment(before, after),
+        position_covariances_m2=position_covariances_m2(final),
+    )
 
 
 def observation_sigmas(placed: PlacedMap) -> Array:

@@ -14,6 +14,7 @@ from fleetmap.drive import Drive, Frame
 from fleetmap.errors import InputError
 from fleetmap.geometry import Pose, Sim3
 from fleetmap.manifest import Quality
+from fleetmap.road_quality import RoadQuality
 from fleetmap.trajectory import Trajectory
 from fleetmap.visual_map import VisualMap
 from fleetmap_mapper.alignment import GnssAligner
@@ -23,6 +24,7 @@ from fleetmap_mapper.georeferencing import GnssTrack, georeference, gnss_track, 
 from fleetmap_mapper.image_mask import ImageMask
 from fleetmap_mapper.map_building import build_visual_map
 from fleetmap_mapper.quality import assess
+from fleetmap_mapper.road_quality import measure_road
 from fleetmap_mapper.segments import join_segments
 from fleetmap_mapper.settings import MapperSettings
 from fleetmap_mapper.slam import PosedFrame, Segment
@@ -40,6 +42,7 @@ class MappedDrive:
     visual_map: VisualMap
     trajectory: Trajectory  # every posed image
     quality: Quality
+    road_quality: RoadQuality
 
 
 def map_drive(
@@ -72,8 +75,10 @@ def map_drive(
 
     frames = pose_frames(placed, growing, posed)
     trajectory = _trajectory(posed, frames, track)
-    quality = assess(placed, trajectory, path_at_fixes(_stamps(posed), frames, track), track, drive, settings)
-    return MappedDrive(build_visual_map(placed, growing, track.anchor), trajectory, quality)
+    path = path_at_fixes(_stamps(posed), frames, track)
+    road = measure_road(placed, trajectory, path, track, settings.quality.weak_gap_s)
+    quality = assess(placed, road, len(trajectory), drive.frame_count, track.anchor, settings)
+    return MappedDrive(build_visual_map(placed, growing, track.anchor), trajectory, quality, road)
 
 
 def _placed_segments(

@@ -2,74 +2,102 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.drive import Drive
+from fleetmap.geodesy import UtmAnchor
 from fleetmap.manifest import Quality
-from fleetmap.trajectory import Trajectory
+from fleetmap.road_quality import RoadQuality
 from fleetmap_mapper.georeferenced_map import PlacedMap, reprojection_errors_px
-from fleetmap_mapper.georeferencing import GnssTrack, PathPoint
-from fleetmap_mapper.settings import MapperSettings
-
-Array = NDArray[np.float64]
+from fleetmap_mapper.settings import MapperSettings, QualityGroup
+from fleetmap_mapper.weak_stretches import find_weak_stretches, visual_ties
 
 
 def assess(
     placed: PlacedMap,
-    trajectory: Trajectory,
-    path: Sequence[PathPoint],
-    track: GnssTrack,
-    drive: Drive,
+    road: RoadQuality,
+    frames_posed: int,
+    frames_total: int,
+    anchor: UtmAnchor,
     settings: MapperSettings,
 ) -> Quality:
-    """Figures about a placed map; ``path`` is the camera at each fix, in map."""
-    residuals = np.array(
-        [p.pose.transform(track.antenna_in_cam_m) - track.positions_m[p.fix] for p in path]
-    ).reshape(-1, 3)
-    covariances = track.covariances_m2[[p.fix for p in path]]
-    reprojection = reprojection_errors_px(placed) / placed.sigmas_px[:, None]
-    rms_px = float(np.sqrt(np.nanmean((reprojection**2).sum(axis=1))))
-    steps_m = np.linalg.norm(np.diff(trajectory.positions_m, axis=0), axis=1)
-    warnings = _warnings(trajectory, drive.frame_count, rms_px, residuals, covariances, settings)
-    return Quality(
+    """Figures about a placed map, and a warning for every one of them that speaks against publishing it."""
+    ties = visual_ties(placed.keyframe_index, placed.point_index, len(placed.poses))
+    weak = find_weak_stretches(road, ties, settings.quality, anchor, is_tied_to_fixes=_is_tied_to_fixes(settings))
+    squares_m2 = (road.fixes.residuals_m.astype(np.float64) ** 2).sum(axis=1)
+    horizontal_m, vertical_m = road.keyframes.horizontal_sigmas_m, road.keyframes.vertical_sigmas_m
+    quality = Quality(
         keyframes=len(placed.poses),
         landmarks=len(placed.points_m),
         observations=len(placed.pixels),
-        length_m=float(steps_m.sum()),
-        frames_total=drive.frame_count,
-        frames_posed=len(trajectory),
-        reprojection_rms_px=rms_px,
-        gnss_fixes=len(path),
-        gnss_residual_rms_m=float(np.sqrt((residuals**2).sum(axis=1).mean())) if len(path) else None,
+        length_m=road.length_m,
+        frames_total=frames_total,
+        frames_posed=frames_posed,
+        reprojection_rms_px=_reprojection_rms_px(placed),
+        gnss_fixes=len(road.fixes),
+        gnss_residual_rms_m=float(np.sqrt(squares_m2.mean())) if len(road.fixes) else None,
         gnss_mode=settings.gnss.mode,
-        publishable=not warnings,
-        warnings=tuple(warnings),
+        publishable=True,
+        position_sigma_m=_percentile(horizontal_m, 50.0),
+        position_sigma_p95_m=_percentile(horizontal_m, 95.0),
+        height_sigma_m=_percentile(vertical_m, 50.0),
+        gnss_residual_sigmas=_percentile(road.fixes.sigmas, 50.0),
+        landmarks_per_m=round(len(placed.points_m) / road.length_m, 3),
+        weak_length_m=round(sum(stretch.to_m - stretch.from_m for stretch in weak), 3),
+        weak_stretches=weak,
     )
+    warnings = tuple(_warnings(quality, road, settings)) or tuple(_weakness(quality, settings.quality))
+    return quality.model_copy(update={"warnings": warnings, "publishable": not warnings})
 
 
-def _warnings(
-    trajectory: Trajectory,
-    frames_total: int,
-    rms_px: float,
-    residuals_m: Array,
-    covariances_m2: Array,
-    settings: MapperSettings,
-) -> list[str]:
-    limits, found = settings.quality, []
-    if len(trajectory) < limits.min_posed_ratio * frames_total:
-        found.append(f"only {len(trajectory)} of {frames_total} images could be posed")
-    gap_s = float(np.diff(trajectory.stamps_ns).max(initial=0)) * 1e-9
+def _is_tied_to_fixes(settings: MapperSettings) -> bool:
+    """Plain SLAM that one Sim(3) places at the end is not to be judged by its fixes."""
+    return settings.gnss.mode in ("final", "full")
+
+
+def _warnings(quality: Quality, road: RoadQuality, settings: MapperSettings) -> Iterator[str]:
+    limits = settings.quality
+    if quality.frames_posed < limits.min_posed_ratio * quality.frames_total:
+        yield f"only {quality.frames_posed} of {quality.frames_total} images could be posed"
+    gap_s = float(np.diff(road.gap_stamps_ns, axis=1).max(initial=0)) * 1e-9
     if gap_s > limits.max_unposed_gap_s:
-        found.append(f"no image is posed for {gap_s:.1f} s in mid-drive")
-    if rms_px > limits.max_reprojection_rms_px:
-        found.append(f"reprojection errors of {rms_px:.2f} px (limit {limits.max_reprojection_rms_px:g})")
-    normalised = np.einsum("fi,fij,fj->f", residuals_m, np.linalg.inv(covariances_m2), residuals_m) / 3.0
-    sigmas = float(np.sqrt(np.median(normalised)))
-    if settings.gnss.mode != "none" and sigmas > limits.max_gnss_residual_sigmas:
-        found.append(
-            f"the map misses its GNSS fixes by {sigmas:.1f} sigma (limit {limits.max_gnss_residual_sigmas:g})"
+        yield f"no image is posed for {gap_s:.1f} s in mid-drive (limit {limits.max_unposed_gap_s:g} s)"
+    if quality.reprojection_rms_px > limits.max_reprojection_rms_px:
+        yield (
+            f"reprojection errors of {quality.reprojection_rms_px:.2f} px "
+            f"(limit {limits.max_reprojection_rms_px:g} px)"
         )
-    return found
+    sigmas = quality.gnss_residual_sigmas
+    if _is_tied_to_fixes(settings) and sigmas is not None and sigmas > limits.max_gnss_residual_sigmas:
+        yield f"the map misses its GNSS fixes by {sigmas:.1f} sigma (limit {limits.max_gnss_residual_sigmas:g})"
+    sigma_m = quality.position_sigma_p95_m
+    if sigma_m is not None and sigma_m > limits.max_position_sigma_m:
+        yield (
+            f"its position is uncertain: 5 % of the keyframes by more than {sigma_m:.2f} m "
+            f"(1 sigma, horizontal; limit {limits.max_position_sigma_m:g} m)"
+        )
+    if quality.landmarks_per_m is not None and quality.landmarks_per_m < limits.min_landmarks_per_m:
+        yield f"only {quality.landmarks_per_m:.1f} landmarks per metre (limit {limits.min_landmarks_per_m:g})"
+
+
+def _weakness(quality: Quality, limits: QualityGroup) -> Iterator[str]:
+    """Said of a map that is sound on the whole: it may be weak in many places."""
+    weak_m = quality.weak_length_m or 0.0
+    if weak_m > limits.max_weak_ratio * quality.length_m:
+        yield (
+            f"{weak_m:.0f} m of {quality.length_m:.0f} m are weak, in {len(quality.weak_stretches)} stretches "
+            f"(limit {100.0 * limits.max_weak_ratio:g} %)"
+        )
+
+
+def _reprojection_rms_px(placed: PlacedMap) -> float:
+    errors = reprojection_errors_px(placed) / placed.sigmas_px[:, None]
+    return float(np.sqrt(np.nanmean((errors**2).sum(axis=1))))
+
+
+def _percentile(values: NDArray[Any], percent: float) -> float | None:
+    known = values[np.isfinite(values)]
+    return round(float(np.percentile(known, percent)), 6) if len(known) else None

@@ -10,7 +10,7 @@ GnssMode = Literal["none", "mapping", "final", "full"]
 
 
 class _Group(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class FeatureGroup(_Group):
@@ -81,12 +81,26 @@ class CalibrationGroup(_Group):
 
 
 class QualityGroup(_Group):
-    """When a map is fit to publish."""
+    """When a map is fit to publish, and which stretches of its road are weak.
 
-    min_posed_ratio: float = 0.95
-    max_reprojection_rms_px: float = 2.0
-    max_gnss_residual_sigmas: float = 4.0  # median residual of the fixes over their own sigma
-    max_unposed_gap_s: float = 5.0
+    Reprojection errors count in sigmas of a feature, which are pixels in the finest octave of the image.
+    """
+
+    min_posed_ratio: float = Field(default=0.95, ge=0.0, le=1.0)  # of all images
+    max_unposed_gap_s: float = Field(default=5.0, ge=0.0)
+    max_reprojection_rms_px: float = Field(default=2.0, ge=0.0)
+    max_gnss_residual_sigmas: float = Field(default=4.0, ge=0.0)  # median of all fixes, over their own
+    max_position_sigma_m: float = Field(default=2.0, ge=0.0)  # horizontal; 95 % of the keyframes must be better
+    min_landmarks_per_m: float = Field(default=5.0, ge=0.0)  # over the whole road
+    max_weak_ratio: float = Field(default=0.5, ge=0.0, le=1.0)  # of the road that weak stretches may take
+
+    weak_position_sigma_m: float = Field(default=1.0, ge=0.0)  # horizontal, of a keyframe
+    weak_reprojection_rms_px: float = Field(default=2.0, ge=0.0)  # of a keyframe
+    weak_gnss_sigmas: float = Field(default=4.0, ge=0.0)  # median of five fixes in a row
+    weak_landmarks_per_m: float = Field(default=5.0, ge=0.0)  # on ten metres
+    weak_landmarks_per_image: int = Field(default=40, ge=0)  # seen by a keyframe
+    weak_gap_s: float = Field(default=0.5, ge=0.0)  # without a posed image, while the vehicle moves
+    weak_ties: int = Field(default=20, ge=0)  # landmarks seen from both before and after a place
 
 
 class MapperSettings(_Group):

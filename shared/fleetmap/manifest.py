@@ -30,7 +30,7 @@ from fleetmap.geodesy import UtmAnchor
 from fleetmap.geometry import Sim3, rotations_from_quat_xyzw
 
 FORMAT_NAME = "fleetmap-map"
-FORMAT_MAJOR, FORMAT_MINOR = 1, 0
+FORMAT_MAJOR, FORMAT_MINOR = 1, 1
 CELL_SIZE_M = 128
 MAX_MANIFEST_BYTES = 16 * 1024 * 1024
 MAX_PART_BYTES = 512 * 1024 * 1024
@@ -137,7 +137,7 @@ class PartRecord(_Model):
     Kinds of part that a newer minor version brings are carried and hashed, but not read.
     """
 
-    kind: PartKind  # "cell", "full"
+    kind: PartKind  # "cell", "full", "quality"
     sha256: Sha256
     size_bytes: int = Field(gt=0, le=MAX_PART_BYTES)
     cell: tuple[CellNumber, CellNumber] | None = None  # floor(easting / 128), floor(northing / 128)
@@ -151,8 +151,32 @@ class PartRecord(_Model):
         return self
 
 
+class WeakReason(_Model):
+    """One thing that makes a stretch weak, at its worst there."""
+
+    kind: PartKind  # as fleetmap_mapper.weak_stretches names it: "position", "landmarks", ...
+    worst: float
+    limit: float
+    text: str  # both with their units, for people
+
+
+class WeakStretch(_Model):
+    """A stretch of the road on which the map is not to be trusted like elsewhere."""
+
+    from_m: float = Field(ge=0.0)  # way driven since the first posed image
+    to_m: float = Field(ge=0.0)
+    start_ns: Int64
+    end_ns: Int64
+    start_lonlat: tuple[LonDeg, LatDeg]
+    end_lonlat: tuple[LonDeg, LatDeg]
+    reasons: tuple[WeakReason, ...] = Field(min_length=1, max_length=64)
+
+
 class Quality(_Model):
-    """What the mapper knows about how good its map is."""
+    """What the mapper knows about how good its map is; None stands for what was not measured.
+
+    What changes along the road lies in the quality part: fleetmap.road_quality.
+    """
 
     keyframes: Total
     landmarks: Total
@@ -166,6 +190,13 @@ class Quality(_Model):
     gnss_mode: Literal["none", "mapping", "final", "full"]
     publishable: bool
     warnings: tuple[str, ...] = ()
+    position_sigma_m: float | None = None  # horizontal, worst direction; median of the keyframes
+    position_sigma_p95_m: float | None = None  # 95 % of the keyframes are better
+    height_sigma_m: float | None = None  # median of the keyframes
+    gnss_residual_sigmas: float | None = None  # median of the fixes
+    landmarks_per_m: float | None = None
+    weak_length_m: float | None = None
+    weak_stretches: tuple[WeakStretch, ...] = Field(default=(), max_length=MAX_PARTS)
 
 
 class Provenance(_Model):
@@ -199,8 +230,9 @@ class Manifest(_Model):
         cells = [part.cell for part in self.parts if part.kind == "cell"]
         if len({part.sha256 for part in self.parts}) != len(self.parts) or len(set(cells)) != len(cells):
             raise ValueError("a part or a cell is listed twice")
-        if sum(part.kind == "full" for part in self.parts) > 1:
-            raise ValueError("there is more than one full part")
+        for kind in ("full", "quality"):
+            if sum(part.kind == kind for part in self.parts) > 1:
+                raise ValueError(f"there is more than one {kind} part")
         return self
 
     def to_bytes(self) -> bytes:

@@ -1,7 +1,8 @@
 """A map package: a folder with ``manifest.json`` and content-addressed parts, ``parts/<sha256>.bin``.
 
-There is one part per 128 m UTM cell that holds keyframes (see fleetmap.cells: what a localizer needs) and one
-full part (see fleetmap.full_part: everything, for mapping on). The map's version is the SHA-256 of the
+There is one part per 128 m UTM cell that holds keyframes (see fleetmap.cells: what a localizer needs), one full
+part (see fleetmap.full_part: everything, for mapping on) and, since format 1.1, a quality part (see
+fleetmap.quality_part: how good the map is along the road). The map's version is the SHA-256 of the
 manifest's bytes.
 """
 
@@ -33,6 +34,8 @@ from fleetmap.manifest import (
     manifest_version,
     parse_manifest,
 )
+from fleetmap.quality_part import decode_quality, encode_quality
+from fleetmap.road_quality import RoadQuality
 from fleetmap.visual_map import LocalizationMap, VisualMap
 
 MANIFEST_NAME = "manifest.json"
@@ -83,6 +86,18 @@ class MapPackage:
                 return decode_full(self._read(record), self.manifest, str(self._path(record)))
         raise MapPackageError(f"{self.folder} holds no full part, only cells; mapping on needs the whole package")
 
+    def road_quality(self) -> RoadQuality | None:
+        """How good the map is along the road; None for a map whose writer did not say.
+
+        Raises:
+            MapPackageError: the quality part is missing or damaged.
+        """
+        for record in self.manifest.parts:
+            if record.kind == "quality":
+                anchor = self.manifest.anchor.to_anchor()
+                return decode_quality(self._read(record), anchor, str(self._path(record)))
+        return None
+
     def _path(self, record: PartRecord) -> Path:
         return self.folder / PARTS_NAME / f"{record.sha256}.bin"
 
@@ -108,6 +123,7 @@ def write_package(
     map_id: str,
     quality: Quality,
     provenance: Provenance,
+    road_quality: RoadQuality | None = None,
     force: bool = False,
 ) -> Manifest:
     """Write a map as a package. The folder is there whole or not at all; the same map gives the same bytes.
@@ -120,7 +136,7 @@ def write_package(
     check_map_id(map_id)
     target = folder.resolve()
     check_target(target, force)
-    parts, manifest = _encode(visual_map, map_id, quality, provenance)
+    parts, manifest = _encode(visual_map, map_id, quality, provenance, road_quality)
     manifest_bytes = manifest.to_bytes()
     if len(manifest_bytes) > MAX_MANIFEST_BYTES:
         raise MapPackageError(f"manifest of map '{map_id}' exceeds {MAX_MANIFEST_BYTES} bytes; split the drive")
@@ -193,10 +209,12 @@ def verify_package(package: MapPackage) -> None:
     """
     manifest, origin = package.manifest, str(package.folder)
     for record in manifest.parts:
-        if record.kind not in ("cell", "full"):
+        if record.kind not in ("cell", "full", "quality"):
             package.part_bytes(record.sha256)
     counted = {"keyframes of all cells": len(package.localization_map().keyframes)}
-    visual_map = package.visual_map()
+    visual_map, road_quality = package.visual_map(), package.road_quality()
+    if road_quality is not None:
+        counted |= {"keyframes of the quality part": len(road_quality.keyframes)}
     full = next(record for record in manifest.parts if record.kind == "full")
     counted |= {"keyframes of the full part": full.keyframes, "keyframes read": len(visual_map.keyframes)}
     _agree(manifest.quality.keyframes, counted, origin)
@@ -215,9 +233,9 @@ def _agree(wanted: int, counted: dict[str, int], origin: str) -> None:
 
 
 def _encode(
-    visual_map: VisualMap, map_id: str, quality: Quality, provenance: Provenance
+    visual_map: VisualMap, map_id: str, quality: Quality, provenance: Provenance, road_quality: RoadQuality | None
 ) -> tuple[list[bytes], Manifest]:
-    """All parts, cells in order and the full one last, and the manifest that lists them in the same order."""
+    """All parts, cells in order, the full one and the quality, and the manifest that lists them in this order."""
     origin = f"map '{map_id}'"
     check_visual_map(visual_map, origin)
     keyframes, landmarks = visual_map.keyframes, visual_map.landmarks
@@ -232,6 +250,10 @@ def _encode(
         records.append(_record("cell", parts[-1], len(cell.keyframe_ids), len(cell.landmark_ids), index))
     parts.append(encode_full(visual_map))
     records.append(_record("full", parts[-1], len(keyframes), len(landmarks), None))
+    if road_quality is not None:
+        _agree(quality.keyframes, {"keyframes along the road": len(road_quality.keyframes)}, origin)
+        parts.append(encode_quality(road_quality, visual_map.anchor))
+        records.append(_record("quality", parts[-1], len(road_quality.keyframes), 0, None))
     lonlat = keyframes_lonlat(visual_map.anchor, keyframes)
     fields = {
         "map_id": map_id,

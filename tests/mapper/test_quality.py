@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from types import SimpleNamespace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,15 +16,21 @@ from fleetmap.trajectory import Trajectory
 from fleetmap_mapper.georeferenced_map import PlacedMap
 from fleetmap_mapper.georeferencing import GnssTrack, PathPoint
 from fleetmap_mapper.quality import assess
-from fleetmap_mapper.settings import GnssGroup, MapperSettings
+from fleetmap_mapper.road_quality import measure_road
+from fleetmap_mapper.settings import GnssGroup, MapperSettings, QualityGroup
 
 KEYFRAMES = 20
+ANCHOR = UtmAnchor(32632, 457_000, 5_428_000, 116)
+
+
+def with_limits(**limits: float) -> MapperSettings:
+    return MapperSettings(quality=QualityGroup(**limits))
 
 
 @pytest.fixture
 def judge(make_world: Any) -> Callable[..., Quality]:
     """The quality of a map of a small world; arguments spoil it."""
-    world = make_world(keyframes=KEYFRAMES, points=200, step_m=2.0)
+    world = make_world(keyframes=KEYFRAMES, points=1200, step_m=2.0)
 
     def judged(
         frames_total: int = KEYFRAMES,
@@ -32,6 +38,7 @@ def judge(make_world: Any) -> Callable[..., Quality]:
         pixel_shift: float = 0.0,
         fix_shift_m: float = 0.0,
         outlying_fixes: int = 0,
+        sigma_m: float = 0.05,
         settings: MapperSettings | None = None,
     ) -> Quality:
         pixels = world.pixels + pixel_shift * world.sigmas_px[:, None] * [1.0, 0.0]
@@ -47,6 +54,7 @@ def judge(make_world: Any) -> Callable[..., Quality]:
             np.zeros(len(pixels), np.int32),
             pixels,
             world.sigmas_px,
+            np.tile(np.eye(3) * sigma_m**2, (KEYFRAMES, 1, 1)),
         )
         stamps = np.arange(KEYFRAMES) * 10**9
         stamps[KEYFRAMES // 2 :] += int(gap_s * 1e9)
@@ -55,10 +63,12 @@ def judge(make_world: Any) -> Callable[..., Quality]:
         positions = world.centres + noise + [fix_shift_m, 0.0, 0.0]
         positions[:outlying_fixes] += 50.0
         covariances = np.tile(np.eye(3) * 0.05**2, (KEYFRAMES, 1, 1))
-        track = GnssTrack(UtmAnchor(32632, 0, 0, 0), stamps, positions, covariances, np.zeros(3))
+        track = GnssTrack(ANCHOR, stamps, positions, covariances, np.zeros(3))
         path = [PathPoint(i, pose) for i, pose in enumerate(world.poses)]
-        drive: Any = SimpleNamespace(frame_count=frames_total)
-        return assess(placed, trajectory, path, track, drive, settings or MapperSettings())
+        settings = settings or MapperSettings()
+        placed = replace(placed, keyframe_stamps_ns=stamps)
+        road = measure_road(placed, trajectory, path, track, settings.quality.weak_gap_s)
+        return assess(placed, road, len(trajectory), frames_total, ANCHOR, settings)
 
     return judged
 
@@ -80,6 +90,12 @@ def test_a_sound_map_is_fit_to_publish(judge):
         ({"gap_s": 7.0}, "no image is posed for 8.0 s in mid-drive"),
         ({"pixel_shift": 3.0}, "reprojection errors of 3.3"),
         ({"fix_shift_m": 1.0}, "the map misses its GNSS fixes by "),
+        (
+            {"sigma_m": 2.5, "settings": with_limits(max_weak_ratio=1.0)},
+            "its position is uncertain: 5 % of the keyframes by more than 2.50 m",
+        ),
+        ({"sigma_m": 1.5}, "38 m of 38 m are weak, in 1 stretches (limit 50 %)"),
+        ({"settings": with_limits(min_landmarks_per_m=100.0)}, "only 27.7 landmarks per metre (limit 100)"),
     ],
 )
 def test_what_is_wrong_is_said(judge, spoilt, warning):
@@ -100,12 +116,9 @@ def test_plain_slam_is_not_judged_by_its_fixes(judge):
 
 
 def test_each_limit_is_a_setting(judge):
-    settings = MapperSettings()
-    patient = replace_quality(settings, min_posed_ratio=0.5, max_unposed_gap_s=60.0, max_reprojection_rms_px=9.0)
+    patient = with_limits(
+        min_posed_ratio=0.5, max_unposed_gap_s=60.0, max_reprojection_rms_px=9.0, max_weak_ratio=1.0
+    )
     assert judge(frames_total=30, gap_s=20.0, pixel_shift=3.0, settings=patient).publishable
-    strict = replace_quality(settings, max_reprojection_rms_px=1.0, max_gnss_residual_sigmas=0.1)
+    strict = with_limits(max_reprojection_rms_px=1.0, max_gnss_residual_sigmas=0.1)
     assert len(judge(settings=strict).warnings) == 2
-
-
-def replace_quality(settings: MapperSettings, **limits: float) -> MapperSettings:
-    return settings.model_copy(update={"quality": settings.quality.model_copy(update=limits)})
