@@ -11,19 +11,30 @@ err by together, such as the slow bias of one receiver, is in no covariance: one
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+
+import gtsam
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from fleetmap.geometry import Pose
 from fleetmap_mapper.adjustment import HUBER_PX
 from fleetmap_mapper.block_tridiagonal import Levels, diagonal_of_inverse, levels_of
-from fleetmap_mapper.georeferencing import HUBER_SIGMAS
-from fleetmap_mapper.global_adjustment import FixTerm, GlobalProblem
+from fleetmap_mapper.global_adjustment import GlobalProblem, graph_without_images
 
 Array = NDArray[np.float64]
 _UNDETERMINED_M = 1e4  # a sigma beyond is no knowledge of a place
+
+
+@dataclass(frozen=True)
+class _Term:
+    """What something other than an image says of some keyframes: J^T J over their tangents in a row."""
+
+    keyframes: list[int]
+    information: Array  # (6 n, 6 n)
 
 
 def pose_covariances(problem: GlobalProblem) -> Array:
@@ -31,30 +42,24 @@ def pose_covariances(problem: GlobalProblem) -> Array:
 
     NaN for keyframes that nothing ties to any fix.
     """
-    levels = levels_of(_covisibility(problem))
+    terms = _terms_beside_images(problem)
+    levels = levels_of(_neighbours(problem, terms))
     diagonal, lower = _reduced_camera_system(problem, levels)
-    for k, information in enumerate(_information_beside_images(problem)):
-        rows = slice(6 * levels.place_of[k], 6 * levels.place_of[k] + 6)
-        diagonal[levels.level_of[k]][rows, rows] += information
-    inverse = [np.full((6 * int(size), 6 * int(size)), np.nan) for size in levels.sizes]
+    for term in terms:
+        _add_term(term, levels, diagonal, lower)
+    inverse = [np.full_like(block, np.nan) for block in diagonal]
     has_fix = np.zeros(len(levels.sizes), np.bool_)
     has_fix[levels.level_of[[fix.keyframe for fix in problem.fixes]]] = True
     for component in levels.components():
-        if not has_fix[component.start : component.stop].any():
-            continue
-        try:
-            blocks = diagonal_of_inverse([diagonal[i] for i in component], [lower[i] for i in component[:-1]])
-        except np.linalg.LinAlgError:
-            continue
-        for i, block in zip(component, blocks, strict=True):
-            inverse[i] = block
+        if has_fix[component.start : component.stop].any():
+            with suppress(np.linalg.LinAlgError):
+                blocks = diagonal_of_inverse([diagonal[i] for i in component], [lower[i] for i in component[:-1]])
+                inverse[component.start : component.stop] = blocks
     covariances = np.array(
-        [
-            inverse[level][6 * place : 6 * place + 6, 6 * place : 6 * place + 6]
-            for level, place in zip(levels.level_of.tolist(), levels.place_of.tolist(), strict=True)
-        ]
+        [inverse[level][rows, rows] for level, rows in (_place(k, levels) for k in range(len(problem.poses)))]
     )
-    covariances[~(np.sqrt(covariances[:, [3, 4, 5], [3, 4, 5]]).max(axis=1) < _UNDETERMINED_M)] = np.nan
+    sigmas_m = np.sqrt(covariances[:, [3, 4, 5], [3, 4, 5]])
+    covariances[~(sigmas_m.max(axis=1) < _UNDETERMINED_M)] = np.nan
     return covariances
 
 
@@ -65,34 +70,40 @@ def position_covariances_m2(problem: GlobalProblem) -> Array:
     return (in_map + in_map.transpose(0, 2, 1)) / 2.0
 
 
-def _covisibility(problem: GlobalProblem) -> csr_array:
-    """Which keyframes (K, K) see a landmark in common."""
-    shape = len(problem.poses), len(problem.points_m)
-    ones = np.ones(len(problem.keyframe_index), np.int32)
-    sees = csr_array((ones, (problem.keyframe_index, problem.point_index)), shape=shape)
+def _terms_beside_images(problem: GlobalProblem) -> list[_Term]:
+    graph, values = graph_without_images(problem)
+    linear = graph.linearize(values)
+    factors = [linear.at(i) for i in range(linear.size())]
+    return [_Term([gtsam.Symbol(key).index() for key in list(f.keys())], f.information()) for f in factors]
+
+
+def _neighbours(problem: GlobalProblem, terms: Sequence[_Term]) -> csr_array:
+    """Which keyframes (K, K) see a landmark in common, or have a term in common."""
+    points = len(problem.points_m)
+    rows = np.concatenate([problem.keyframe_index, *(term.keyframes for term in terms)]).astype(np.int64)
+    of_terms = [np.full(len(term.keyframes), points + i) for i, term in enumerate(terms)]
+    columns = np.concatenate([problem.point_index, *of_terms]).astype(np.int64)
+    shape = len(problem.poses), points + len(terms)
+    sees = csr_array((np.ones(len(rows), np.int32), (rows, columns)), shape=shape)
     return csr_array(sees @ sees.T)
 
 
-def _information_beside_images(problem: GlobalProblem) -> Array:
-    """J^T J (K, 6, 6) of the fixes and of the level prior."""
-    information = np.zeros((len(problem.poses), 6, 6))
-    for fix in problem.fixes:
-        J = _weighted_jacobian(fix, problem.poses[fix.keyframe])
-        information[fix.keyframe] += J.T @ J
-    for k, pose in enumerate(problem.poses):
-        tilt = np.array([0.0, -pose.rotation[2, 2], pose.rotation[2, 1], 0.0, 0.0, 0.0])
-        information[k] += np.outer(tilt, tilt) / (problem.level_sigma_rad**2 * len(problem.poses))
-    return information
+def _add_term(term: _Term, levels: Levels, diagonal: Sequence[Array], lower: Sequence[Array]) -> None:
+    for m, keyframe in enumerate(term.keyframes):
+        level, columns = _place(keyframe, levels)
+        for n, other in enumerate(term.keyframes):
+            other_level, rows = _place(other, levels)
+            share = term.information[6 * n : 6 * n + 6, 6 * m : 6 * m + 6]
+            if other_level == level:
+                diagonal[level][rows, columns] += share
+            elif other_level == level + 1:
+                lower[level][rows, columns] += share
 
 
-def _weighted_jacobian(fix: FixTerm, pose: Pose) -> Array:
-    """Of the fix's residual by the keyframe's pose (3, 6), whitened, times the root of Huber's weight."""
-    x, y, z = fix.arm_in_cam_m
-    by_rotation = np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])
-    whiten = np.linalg.inv(np.linalg.cholesky(fix.covariance_m2))
-    error = float(np.linalg.norm(whiten @ (pose.transform(fix.arm_in_cam_m) - fix.position_m)))
-    root = np.sqrt(min(1.0, HUBER_SIGMAS / max(error, 1e-12)))
-    return np.asarray(root * whiten @ pose.rotation @ np.hstack([by_rotation, np.eye(3)]))
+def _place(keyframe: int, levels: Levels) -> tuple[int, slice]:
+    """The level of a keyframe and its rows there."""
+    first = 6 * int(levels.place_of[keyframe])
+    return int(levels.level_of[keyframe]), slice(first, first + 6)
 
 
 def _reduced_camera_system(problem: GlobalProblem, levels: Levels) -> tuple[list[Array], list[Array]]:

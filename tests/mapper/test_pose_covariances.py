@@ -43,12 +43,8 @@ def problem_of(world: Any, rng: np.random.Generator, every: int = 4) -> GlobalPr
 
 def gtsam_covariances(problem: GlobalProblem) -> np.ndarray:
     """Of the graph that the adjustment builds, with its points in it."""
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    graph, values = global_adjustment.graph_without_images(problem)
     global_adjustment._add_observations(graph, problem)
-    global_adjustment._add_fixes(graph, problem.fixes)
-    global_adjustment._add_level_prior(graph, len(problem.poses), problem.level_sigma_rad)
-    for i, pose in enumerate(problem.poses):
-        values.insert(X(i), gtsam.Pose3(gtsam.Rot3(pose.rotation), pose.translation_m))
     for j, point in enumerate(problem.points_m):
         values.insert(L(j), point)
     marginals = gtsam.Marginals(graph, values)
