@@ -84,7 +84,7 @@ def solve_bordered(images: LinearisedImages, rest: LinearisedRest, change: Array
     poses_follow, alone = -solved[:, :-1], -solved[:, -1]
 
     information = reduced.S_cc + np.eye(len(change)) + S_pc.T @ poses_follow
-    dc = -np.linalg.solve(information, reduced.b_c + change + S_pc.T @ alone)
+    dc = np.linalg.solve(information, -(reduced.b_c + change + S_pc.T @ alone)).astype(np.float64)
     dp = alone + poses_follow @ dc
     of_poses = _by_observation(np.column_stack([poses_follow, dp]), images)  # (M, 6, C + 1)
     carried = sum_rows(_products(reduced.W, of_poses), reduced.point_index, len(reduced.gl))
@@ -99,7 +99,7 @@ def _eliminate_points(images: LinearisedImages, damping: float) -> _WithoutPoint
     point_index, k = np.repeat(np.arange(P), np.diff(images.starts)), images.keyframe_index
     V = sum_rows(_products(by_point, by_point), point_index, P)
     V += np.eye(3) * (damping * V + 1e-12)
-    V_inverse = np.linalg.inv(V)
+    V_inverse = np.asarray(np.linalg.inv(V), dtype=np.float64)
     gl = sum_rows(_products(by_point, r), point_index, P)
     W = _products(by_pose, by_point)
     Wc = sum_rows(_products(by_calibration, by_point), point_index, P)

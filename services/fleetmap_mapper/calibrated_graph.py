@@ -2,10 +2,10 @@
 
     min over c, {T_i}, {X_j} of  sum rho(|z_ij - pi(c, T_i, X_j)|^2 in Omega) + fixes and priors + |c - c_0|^2 in P
 
-The z_ij are recorded pixels, distorted as they came: undistorted ones would move with c, and a shorter focal length
-would shrink their errors. What is not an image (fixes, level prior, ...) is taken from the GTSAM graph and linearised
-there; the images' part is linearised here for the drive's own lens model. The prior P holds what a drive does not
-determine where the recording has it.
+The z_ij are recorded pixels, distorted as they came: undistorted ones would move with c, and a shorter focal
+length would shrink their errors. What is not an image (fixes, level prior, ...) is taken from the GTSAM graph and
+linearised there; the images' part is linearised here for the drive's own lens model. The prior P holds what a
+drive does not determine where the recording has it.
 """
 
 from __future__ import annotations
@@ -164,8 +164,8 @@ class CalibratedGraph:
         if not residuals:
             return LinearisedRest(sp.csr_matrix((0, size)), np.zeros(0))
         places = (np.concatenate(rows), np.concatenate(columns))
-        A = sp.csr_matrix((np.concatenate(entries), places), shape=(row, size))
-        return LinearisedRest(A, np.concatenate(residuals))
+        jacobian = sp.csr_matrix((np.concatenate(entries), places), shape=(row, size))
+        return LinearisedRest(jacobian, np.concatenate(residuals))
 
 
 def _columns(keyframes: int, values: gtsam.Values) -> dict[int, NDArray[np.int64]]:

@@ -18,8 +18,8 @@ from fleetmap_mapper.bordered_system import (
     BorderedStep,
     LinearisedImages,
     LinearisedRest,
-    sum_rows,
     solve_bordered,
+    sum_rows,
 )
 from fleetmap_mapper.calibrated_graph import CalibratedGraph
 from fleetmap_mapper.calibration_parameters import (
@@ -67,7 +67,7 @@ class CalibrationEstimate:
 def estimate_calibration(
     problem: GlobalProblem, settings: CalibrationGroup, recorded: Camera | None = None
 ) -> CalibrationEstimate:
-    """The drive's own calibration from a finished map, against ``recorded`` (default: the one it was made with)."""
+    """The drive's own calibration from a finished map, against ``recorded`` (default: the camera of the map)."""
     prior = calibration_prior(recorded or problem.camera, settings)
     graph = CalibratedGraph(_thinned(problem), prior)
     state, _ = optimise(graph, _STEPS)
@@ -114,7 +114,8 @@ def _judged(prior: CalibrationPrior, change: Array, covariance: Array) -> Calibr
         float(sigmas[0] * _focal_px(fitted)),
         (float(sigmas[2]), float(sigmas[3])),
         tuple(sigmas[LENS].tolist()),
-        *(_disagreement(by_change[:, :, part], change[part], covariance[part, part]) for part in (FOCAL, CENTRE)),
+        _disagreement(by_change[:, :, FOCAL], change[FOCAL], covariance[FOCAL, FOCAL]),
+        _disagreement(by_change[:, :, CENTRE], change[CENTRE], covariance[CENTRE, CENTRE]),
         _disagreement(by_change[:, :, LENS], change[LENS], covariance[LENS, LENS]),
     )
 
@@ -143,7 +144,7 @@ def _covariance(images: LinearisedImages, rest: LinearisedRest, step: BorderedSt
     clusters = k[images.starts[:-1]] // stretch if len(counts) else np.zeros(0, np.int64)
     by_cluster = sum_rows(scores, clusters[point_index], int(clusters.max(initial=0)) + 1)
     by_rest = rest.jacobian @ step.poses_by_calibration
-    own = np.linalg.inv(step.information)
+    own = np.asarray(np.linalg.inv(step.information), dtype=np.float64)
     meat = by_cluster.T @ by_cluster + by_rest.T @ by_rest + np.eye(len(own))
     sandwich = own @ meat @ own
     sandwich *= len(by_cluster) / max(len(by_cluster) - 1, 1)

@@ -91,7 +91,7 @@ def match_landmarks(
     ids, pixels, octaves = visible_landmarks(growing, local, vis_from_cam)
     found = match_by_projection(
         pixels,
-        radius_px * SCALE_FACTOR ** octaves.astype(np.float64),
+        radius_px * SCALE_FACTOR ** octaves.astype(np.float64) * growing.camera.magnification(pixels),
         octaves - 1,
         octaves + 1,
         growing.descriptors[ids],

@@ -18,8 +18,9 @@ _MIN_DEPTH = 1e-6
 def visible_landmarks(growing: GrowingMap, local: Ids, vis_from_cam: Pose) -> tuple[Ids, Array, NDArray[np.int64]]:
     """The landmarks of ``local`` that a camera should see, their pixels (n, 2) and octaves to look at (n,)."""
     camera = growing.camera
+    left, top, right, bottom = camera.ideal_bounds_px
     ids, pixels, octaves = _visible(
-        (camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, camera.width_px, camera.height_px),
+        (camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, left, top, right, bottom),
         np.ascontiguousarray(vis_from_cam.rotation),
         vis_from_cam.translation_m,
         local,
@@ -28,12 +29,15 @@ def visible_landmarks(growing: GrowingMap, local: Ids, vis_from_cam: Pose) -> tu
         growing.distances,
         growing.octaves,
     )
-    return ids, pixels, octaves
+    if not camera.has_distortion:
+        return ids, pixels, octaves
+    seen = camera.is_inside(camera.distort(pixels)) & camera.is_within_reach(pixels)
+    return ids[seen], pixels[seen], octaves[seen]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _visible(camera, rotation, centre, local, points, normals, distances, seen_octaves):  # type: ignore[no-untyped-def]
-    fx, fy, cx, cy, width, height = camera
+    fx, fy, cx, cy, left, top, right, bottom = camera
     ids, pixels = np.empty(len(local), np.int32), np.empty((len(local), 2))
     octaves = np.empty(len(local), np.int64)
     count = 0
@@ -44,7 +48,7 @@ def _visible(camera, rotation, centre, local, points, normals, distances, seen_o
             continue
         u = fx * (rotation[0, 0] * x + rotation[1, 0] * y + rotation[2, 0] * z) / depth + cx
         v = fy * (rotation[0, 1] * x + rotation[1, 1] * y + rotation[2, 1] * z) / depth + cy
-        if not (0.0 <= u <= width - 1 and 0.0 <= v <= height - 1):
+        if not (left <= u <= right and top <= v <= bottom):
             continue
         distance = np.sqrt(x * x + y * y + z * z)
         towards = -(x * normals[landmark, 0] + y * normals[landmark, 1] + z * normals[landmark, 2])

@@ -7,6 +7,7 @@ Distortion: see fleetmap.distortion.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -127,6 +128,21 @@ class Camera:
         )
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.asarray(larger / determinant)
+
+    @cached_property
+    def ideal_bounds_px(self) -> tuple[float, float, float, float]:
+        """Left, top, right and bottom, in undistorted pixels, of what mapping uses of the image."""
+        right, bottom = self.width_px - 1.0, self.height_px - 1.0
+        if not self.has_distortion:
+            return 0.0, 0.0, right, bottom
+        grid = np.stack(np.meshgrid(np.linspace(0, right, 65), np.linspace(0, bottom, 65)), axis=2).reshape(-1, 2)
+        ideal = self.undistort(grid)
+        ideal = ideal[self.is_within_reach(ideal)]
+        if len(ideal) == 0:
+            return 0.0, 0.0, right, bottom
+        margin_px = 2.0 * (ideal.max(axis=0) - ideal.min(axis=0)) / 64.0  # the grid steps over the limit
+        (left, top), (right, bottom) = ideal.min(axis=0) - margin_px, ideal.max(axis=0) + margin_px
+        return float(left), float(top), float(right), float(bottom)
 
     def is_inside(self, pixels: Array, border_px: float = 0.0) -> NDArray[np.bool_]:
         """Which pixels (N, 2) lie in the image, at least ``border_px`` from its edge; NaN is outside."""

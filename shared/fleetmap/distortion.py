@@ -170,7 +170,9 @@ def _equidistant_jacobian(coefficients: Coefficients, ideal: Array) -> Array:
     square = theta * theta
     radial = np.polyval(_slope_polynomial(coefficients), square) / (1.0 + radius * radius)
     with np.errstate(divide="ignore", invalid="ignore"):
-        across = np.where(radius > 1e-12, theta * np.polyval(_theta_polynomial(coefficients), square) / radius, 1.0)
+        across = np.where(
+            radius > 1e-12, theta * np.polyval(_theta_polynomial(coefficients), square) / radius, 1.0
+        )
         outwards = np.where(radius[:, None] > 1e-12, ideal / radius[:, None], 0.0)
     along = np.einsum("n,ni,nj->nij", radial - across, outwards, outwards)
     return np.asarray(across[:, None, None] * np.eye(2) + along)

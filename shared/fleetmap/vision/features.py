@@ -45,14 +45,16 @@ class Features:
     octaves: NDArray[np.uint8]  # (N,) uint8 pyramid level
     descriptors: NDArray[np.uint8]  # (N, 32) uint8
     scale_factor: float  # between pyramid levels
+    camera: Camera | None = None  # whose lens was undone; None = one without distortion
 
     def __len__(self) -> int:
         return len(self.pixels)
 
     @cached_property
     def sigmas_px(self) -> Array:
-        """Localisation sigma of each feature (N,): one pixel of the pyramid level it was found on."""
-        return np.asarray(self.scale_factor ** self.octaves.astype(np.float64))
+        """Localisation sigma of each feature (N,): one pixel of its pyramid level, stretched by undistorting."""
+        recorded_px = np.asarray(self.scale_factor ** self.octaves.astype(np.float64))
+        return recorded_px if self.camera is None else recorded_px * self.camera.magnification(self.pixels)
 
 
 class FeatureExtractor:
@@ -84,19 +86,20 @@ class FeatureExtractor:
             octaves=np.array([keypoint.octave for keypoint in described], dtype=np.uint8)[valid],
             descriptors=np.ascontiguousarray(descriptors[valid], dtype=np.uint8),
             scale_factor=self.settings.scale_factor,
+            camera=self.camera if self.camera.has_distortion else None,
         )
 
     def _undistort(self, distorted: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Undistorted pixels (N, 2), and which are to be trusted.
 
-        Towards the corners of a strongly distorted image the polynomial may have no inverse.
+        Towards the corners of a strongly distorted image the polynomial may have no inverse, and what a fisheye
+        lens sees beyond fleetmap.camera.WIDEST_ANGLE_DEG is left out.
         """
         with np.errstate(all="ignore"):
             pixels = self.camera.undistort(distorted)
             back = self.camera.project(self.camera.unproject(distorted))
             valid = np.linalg.norm(back - distorted, axis=1) < 0.1
-        near = self.camera.is_inside(pixels, border_px=-float(max(self.camera.width_px, self.camera.height_px)))
-        return pixels, np.asarray(valid & near)
+            return pixels, np.asarray(valid & self.camera.is_within_reach(pixels))
 
     def _check_size(self, image: NDArray[np.uint8]) -> None:
         calibrated = (self.camera.height_px, self.camera.width_px)
