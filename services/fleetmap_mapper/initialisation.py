@@ -16,12 +16,12 @@ from fleetmap.vision.features import Features
 from fleetmap.vision.matching import match_descriptors
 from fleetmap_mapper.settings import MapperSettings
 from fleetmap_mapper.triangulation import is_consistent, parallax_rad, triangulate
-from fleetmap_mapper.two_view_motion import motion_of_least_turn, motion_of_most
+from fleetmap_mapper.two_view_motion import motions_between
 
 Array = NDArray[np.float64]
 _MAX_HAMMING, _RATIO = 64, 0.8
 _MIN_CONSISTENT = 0.6  # of all matches: moving traffic may own the rest
-_CLEARLY_MORE = 0.75  # a motion that turns less may explain so much fewer: the rest may ride on a car ahead
+_ABOUT_AS_MANY = 0.75  # of the most: the rest may ride on a car ahead
 _NOMINAL_DEPTH = 10.0  # median depth of the first map: its scale is free, this keeps numbers of order one
 
 
@@ -64,16 +64,16 @@ def map_from_two_views(
 
 
 def _motion(camera: Camera, pixels_a: Array, sigmas_a: Array, pixels_b: Array, sigmas_b: Array, seed: int) -> Pose:
-    """``first_from_second``, of unit length: the one that turns least, unless another explains clearly more."""
-    most = motion_of_most(camera, pixels_a, pixels_b, seed)
-    least = motion_of_least_turn(camera, pixels_a, pixels_b, seed)
-    explained = [
-        np.count_nonzero(_triangulated(camera, motion, pixels_a, sigmas_a, pixels_b, sigmas_b)[1])
-        for motion in (most, least, Pose(least.rotation, -least.translation_m))
-    ]
-    if max(explained[1:]) < _CLEARLY_MORE * explained[0]:
-        return most
-    return least if explained[1] > explained[2] else Pose(least.rotation, -least.translation_m)
+    """``first_from_second``, of unit length: the one that lets the scene be far, unless another explains more."""
+    motions = motions_between(camera, pixels_a, pixels_b, seed)
+    explained, parallaxes = [], []
+    for motion in motions:
+        points, consistent = _triangulated(camera, motion, pixels_a, sigmas_a, pixels_b, sigmas_b)
+        explained.append(int(consistent.sum()))
+        parallax = parallax_rad(points[consistent], np.zeros(3), motion.translation_m)
+        parallaxes.append(float(parallax.mean()) if len(parallax) else np.inf)
+    enough = np.array(explained) >= _ABOUT_AS_MANY * max(explained)
+    return motions[int(np.argmin(np.where(enough, parallaxes, np.inf)))]
 
 
 def _triangulated(

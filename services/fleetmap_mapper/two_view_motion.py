@@ -2,9 +2,9 @@
 
 A camera with a narrow view that looks along a road can hardly tell a sideways step from a turn: where most matches
 are far away, or on a car that drives ahead, a wrong motion that turns much and lets everything lie near explains
-as many of them as the true one, which turns little and lets them be far. So two explanations are sought, and
-unless the first explains clearly more, the one that turns least wins. Source of the ambiguity: G. Adiv, "Inherent
-ambiguities in recovering 3-D motion and structure from a noisy flow field", PAMI 1989.
+as many of them as the true one, which turns little and lets them be far. So several explanations are sought, and
+the caller prefers the one with least parallax. Source of the ambiguity: G. Adiv, "Inherent ambiguities in
+recovering 3-D motion and structure from a noisy flow field", PAMI 1989.
 """
 
 from __future__ import annotations
@@ -20,35 +20,35 @@ from fleetmap_mapper.triangulation import rays_of
 Array = NDArray[np.float64]
 
 _MAX_EPIPOLAR_PX = 1.5
-_FAR_PX = 3.0  # a match that a mere turn predicts so well counts as far away
+_FAR_PX = (1.5, 3.0)  # a match that a mere turn predicts so well counts as far away
+_LOSSES_PX = (1.5, 3.0)  # beyond, a match counts as an outlier when the start is refined
 _TRIALS = 200
 
 
-def motion_of_most(camera: Camera, pixels_a: Array, pixels_b: Array, seed: int) -> Pose:
-    """``a_from_b`` with |t| = 1 that the largest number of matches (N, 2) agrees with.
+def motions_between(camera: Camera, pixels_a: Array, pixels_b: Array, seed: int) -> list[Pose]:
+    """``a_from_b`` with |t| = 1 as different readings of matches (N, 2) have it, of both signs where it is open.
 
-    Source: Nister's five-point method in LO-RANSAC, as PoseLib implements it.
+    The first is the one that the largest number agrees with (Nister's five-point method in LO-RANSAC, as PoseLib
+    implements it); the others start from the mere turn that explains most.
     """
     model = _model(camera)
     b_from_a, _ = poselib.estimate_relative_pose(
         pixels_a, pixels_b, model, model, {"max_epipolar_error": _MAX_EPIPOLAR_PX, "seed": seed}
     )
-    return Pose(np.asarray(b_from_a.R), np.asarray(b_from_a.t)).inverse()
-
-
-def motion_of_least_turn(camera: Camera, pixels_a: Array, pixels_b: Array, seed: int) -> Pose:
-    """``a_from_b`` with |t| = 1 near the rotation that by itself explains the most of the matches (N, 2)."""
+    motions = [_inverse(b_from_a)]
     rng = np.random.default_rng(seed)
     rays_a, rays_b = (rays_of(camera, Pose.identity(), pixels) for pixels in (pixels_a, pixels_b))
-    rotation = _rotation_of_most(rng, rays_a, rays_b, _FAR_PX / camera.fx_px)
-    normals = np.cross(rays_a @ rotation.T, rays_b)  # of the epipolar planes: t lies in all of them
-    direction = _direction_of_most(rng, normals, _MAX_EPIPOLAR_PX / camera.fx_px)
-    start = poselib.CameraPose()
-    start.R, start.t = rotation, direction
-    model = _model(camera)
-    options = {"loss_type": "TRUNCATED", "loss_scale": 2.0 * _MAX_EPIPOLAR_PX}
-    b_from_a, _ = poselib.refine_relative_pose(pixels_a, pixels_b, start, model, model, options)
-    return Pose(np.asarray(b_from_a.R), np.asarray(b_from_a.t)).inverse()
+    for far_px in _FAR_PX:
+        start = poselib.CameraPose()
+        start.R = _rotation_of_most(rng, rays_a, rays_b, far_px / camera.fx_px)
+        normals = np.cross(rays_a @ start.R.T, rays_b)  # of the epipolar planes: t lies in all of them
+        start.t = _direction_of_most(rng, normals, _MAX_EPIPOLAR_PX / camera.fx_px)
+        for loss_px in _LOSSES_PX:
+            options = {"loss_type": "TRUNCATED", "loss_scale": loss_px}
+            refined, _ = poselib.refine_relative_pose(pixels_a, pixels_b, start, model, model, options)
+            motion = _inverse(refined)
+            motions += [motion, Pose(motion.rotation, -motion.translation_m)]
+    return motions
 
 
 def _rotation_of_most(rng: np.random.Generator, rays_a: Array, rays_b: Array, max_angle: float) -> Array:
@@ -80,6 +80,10 @@ def _direction_of_most(rng: np.random.Generator, normals: Array, max_distance: f
         return np.array([0.0, 0.0, 1.0])
     costs = np.minimum(np.abs(directions @ normals.T), max_distance).sum(axis=1)
     return np.asarray(directions[np.argmin(costs)])
+
+
+def _inverse(b_from_a: poselib.CameraPose) -> Pose:
+    return Pose(np.asarray(b_from_a.R), np.asarray(b_from_a.t)).inverse()
 
 
 def _model(camera: Camera) -> dict[str, object]:
