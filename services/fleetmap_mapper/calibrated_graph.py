@@ -38,7 +38,6 @@ class Observations:
     sigmas_px: Array  # (M,) of the recorded pixels
     keyframe_index: NDArray[np.int64]  # (M,)
     starts: NDArray[np.int64]  # (P + 1,) first observation of each point
-    order: NDArray[np.int64]  # (M,) the problem's observations as they stand here
 
     @property
     def point_index(self) -> NDArray[np.int64]:
@@ -55,7 +54,6 @@ def recorded_observations(problem: GlobalProblem) -> Observations:
         problem.sigmas_px[order] / problem.camera.magnification(ideal),
         problem.keyframe_index[order].astype(np.int64),
         np.searchsorted(problem.point_index[order], np.arange(len(problem.points_m) + 1)).astype(np.int64),
-        order,
     )
 
 

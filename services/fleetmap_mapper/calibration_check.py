@@ -8,12 +8,15 @@ between neighbouring tracks, and counting every one of them as a witness would m
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import logging
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.camera import Camera
+from fleetmap.errors import CalibrationError
+from fleetmap.manifest import CalibrationRecord, CameraRecord
 from fleetmap_mapper.bordered_system import (
     BorderedStep,
     LinearisedImages,
@@ -34,6 +37,7 @@ from fleetmap_mapper.calibration_refinement import optimise
 from fleetmap_mapper.global_adjustment import GlobalProblem
 from fleetmap_mapper.settings import CalibrationGroup
 
+_log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
 _STEPS = 4
@@ -65,19 +69,41 @@ class CalibrationEstimate:
 
 
 def estimate_calibration(
-    problem: GlobalProblem, settings: CalibrationGroup, recorded: Camera | None = None
-) -> CalibrationEstimate:
-    """The drive's own calibration from a finished map, against ``recorded`` (default: the camera of the map)."""
-    prior = calibration_prior(recorded or problem.camera, settings)
-    graph = CalibratedGraph(_thinned(problem), prior)
-    state, _ = optimise(graph, _STEPS)
-    images, rest = graph.linearised(state)
-    step = solve_bordered(images, rest, state.change, _DAMPING)
-    return _judged(prior, state.change, _covariance(images, rest, step))
+    problem: GlobalProblem, settings: CalibrationGroup, recorded: Camera
+) -> CalibrationEstimate | None:
+    """The drive's own calibration from a finished map, against the recorded one; None where it says nothing."""
+    prior = calibration_prior(recorded, settings)
+    try:
+        graph = CalibratedGraph(_thinned(problem), prior)
+        state, _ = optimise(graph, _STEPS)
+        images, rest = graph.linearised(state)
+        step = solve_bordered(images, rest, state.change, _DAMPING)
+        return _judged(prior, state.change, _covariance(images, rest, step))
+    except (np.linalg.LinAlgError, RuntimeError, CalibrationError) as error:  # RuntimeError: SuperLU, singular
+        _log.info("the calibration could not be checked: %s", error)
+        return None
 
 
-def calibration_remarks(estimate: CalibrationEstimate, settings: CalibrationGroup) -> list[str]:
-    """One line for each part of the recorded calibration that the drive contradicts."""
+def calibration_record(
+    estimate: CalibrationEstimate | None, map_camera: Camera, settings: CalibrationGroup
+) -> CalibrationRecord | None:
+    """The estimate as the manifest of a map made with ``map_camera`` keeps it."""
+    if estimate is None:
+        return None
+    return CalibrationRecord(
+        recorded=CameraRecord(**asdict(estimate.recorded)),
+        fitted=CameraRecord(**asdict(map_camera if settings.refine else estimate.fitted)),
+        focal_sigma_px=estimate.focal_sigma_px,
+        centre_sigma_px=estimate.centre_sigma_px,
+        distortion_sigma=estimate.distortion_sigma,
+        refined=settings.refine,
+    )
+
+
+def calibration_remarks(estimate: CalibrationEstimate | None, settings: CalibrationGroup) -> list[str]:
+    """One line for each part of the recorded calibration that the drive contradicts; none once it is refined."""
+    if estimate is None or settings.refine:
+        return []
     recorded, fitted, found = estimate.recorded, estimate.fitted, []
 
     def matters(part: Disagreement) -> bool:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap.camera import Camera
 from fleetmap_mapper.bordered_system import solve_bordered
 from fleetmap_mapper.calibrated_graph import CalibratedGraph, State
 from fleetmap_mapper.calibration_parameters import CalibrationPrior
 from fleetmap_mapper.global_adjustment import GlobalProblem
 
+_log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
 _MAX_STEPS = 50
@@ -32,7 +35,9 @@ def refine_calibration(problem: GlobalProblem, prior: CalibrationPrior) -> Refin
     """Move the calibration with everything else to the optimum of all observations, fixes and priors."""
     graph = CalibratedGraph(problem, prior)
     state, cost = optimise(graph, _MAX_STEPS)
-    return Refined(_renewed(problem, graph, state), graph.cost(graph.start), cost)
+    refined = Refined(_renewed(problem, graph, state), graph.cost(graph.start), cost)
+    _log.info("calibration refined from %s to %s", problem.camera, refined.problem.camera)
+    return refined
 
 
 def optimise(graph: CalibratedGraph, max_steps: int) -> tuple[State, float]:
@@ -56,17 +61,23 @@ def optimise(graph: CalibratedGraph, max_steps: int) -> tuple[State, float]:
     return state, cost
 
 
+def seen_anew(pixels: Array, before: Camera, after: Camera) -> Array:
+    """Undistorted pixels (N, 2) of one calibration as another one undistorts them; as before where it cannot."""
+    if before == after:
+        return pixels
+    renewed = after.undistort(before.distort(pixels))
+    return np.where(np.isfinite(renewed).all(axis=1, keepdims=True), renewed, pixels)
+
+
 def _renewed(problem: GlobalProblem, graph: CalibratedGraph, state: State) -> GlobalProblem:
-    """The problem seen through the refined camera; a pixel it cannot undistort becomes NaN."""
+    """The problem seen through the refined camera."""
     camera = graph.camera(state)
-    seen = graph.observations
-    back = np.argsort(seen.order)
-    pixels = camera.undistort(seen.pixels[back])
+    pixels = seen_anew(problem.pixels, problem.camera, camera)
     return replace(
         problem,
         camera=camera,
         poses=graph.poses(state),
         points_m=state.points_m,
         pixels=pixels,
-        sigmas_px=seen.sigmas_px[back] * camera.magnification(pixels),
+        sigmas_px=problem.sigmas_px * camera.magnification(pixels) / problem.camera.magnification(problem.pixels),
     )

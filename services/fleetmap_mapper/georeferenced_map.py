@@ -11,10 +11,14 @@ from numpy.typing import NDArray
 from fleetmap.camera import Camera
 from fleetmap.geometry import Pose, Sim3, umeyama_alignment
 from fleetmap.vision.absolute_pose import refine_absolute_pose
+from fleetmap_mapper.calibration_check import CalibrationEstimate, estimate_calibration
+from fleetmap_mapper.calibration_parameters import calibration_prior
+from fleetmap_mapper.calibration_refinement import refine_calibration, seen_anew
 from fleetmap_mapper.georeferencing import GnssTrack, path_at_fixes
 from fleetmap_mapper.global_adjustment import FixTerm, GlobalProblem, adjust_globally
 from fleetmap_mapper.growing_map import GrowingMap
 from fleetmap_mapper.pose_covariances import position_covariances_m2
+from fleetmap_mapper.settings import CalibrationGroup
 from fleetmap_mapper.slam import PosedFrame
 from fleetmap_mapper.triangulation import CHI2_2DOF_95
 
@@ -40,6 +44,7 @@ class PlacedMap:
     pixels: Array  # (M, 2) undistorted
     sigmas_px: Array  # (M,)
     position_covariances_m2: Array | None = None  # (K, 3, 3) of the final graph; NaN where no fix determines it
+    calibration: CalibrationEstimate | None = None  # as the final graph has it
 
 
 def place(growing: GrowingMap, map_from_vis: Sim3) -> PlacedMap:
@@ -81,6 +86,7 @@ def adjust_with_fixes(
     posed: Sequence[PosedFrame],
     track: GnssTrack,
     level_sigma_deg: float,
+    calibration: CalibrationGroup,
     progress: Callable[[str, int, int], None],
 ) -> PlacedMap:
     """UGBA, twice: the second time without the first one's outliers and with the fixes carried anew."""
@@ -98,6 +104,9 @@ def adjust_with_fixes(
             carry_fixes(placed, posed, frames, track),
             np.radians(level_sigma_deg),
         )
+        if calibration.refine:
+            problem = refine_calibration(problem, calibration_prior(growing.camera, calibration)).problem
+            placed = replace(placed, camera=problem.camera, pixels=problem.pixels)
         optimum = adjust_globally(problem)
         placed = without_outliers(replace(placed, poses=optimum.poses, points_m=optimum.points_m))
     before = np.array([k.vis_from_cam.translation_m for k in growing.keyframes])
@@ -106,6 +115,7 @@ def adjust_with_fixes(
     return replace(
         placed,
         map_from_vis=umeyama_alignment(before, after),
+        calibration=estimate_calibration(final, calibration, growing.camera),
         position_covariances_m2=position_covariances_m2(final),
     )
 
@@ -159,8 +169,9 @@ def pose_frames(placed: PlacedMap, growing: GrowingMap, posed: Sequence[PosedFra
         resolved = growing.resolve(frame.landmarks)
         rows = np.where(resolved >= 0, row_of[np.maximum(resolved, 0)], -1)
         known = rows >= 0
+        pixels = seen_anew(frame.pixels, growing.camera, placed.camera)
         refined = refine_absolute_pose(
-            frame.pixels[known], placed.points_m[rows[known]], frame.sigmas_px[known], placed.camera, guess
+            pixels[known], placed.points_m[rows[known]], frame.sigmas_px[known], placed.camera, guess
         )
         poses.append(guess if refined is None else refined.map_from_cam)
     return poses

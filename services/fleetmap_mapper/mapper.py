@@ -70,7 +70,9 @@ def map_drive(
     if settings.gnss.mode in ("none", "mapping"):
         placed = without_outliers(placed)
     else:
-        placed = adjust_with_fixes(placed, growing, posed, track, settings.gnss.level_sigma_deg, progress)
+        placed = adjust_with_fixes(
+            placed, growing, posed, track, settings.gnss.level_sigma_deg, settings.calibration, progress
+        )
     placed = replace(placed, map_from_vis=placed.map_from_vis @ map_from_vis)
 
     frames = pose_frames(placed, growing, posed)

@@ -131,6 +131,17 @@ class CameraRecord(_Model):
         return Camera(**dict(self))
 
 
+class CalibrationRecord(_Model):
+    """The camera's calibration as the recording has it, and as the drive itself would have it."""
+
+    recorded: CameraRecord
+    fitted: CameraRecord
+    focal_sigma_px: float = Field(ge=0.0)  # one sigma each, of the fitted
+    centre_sigma_px: tuple[float, float]
+    distortion_sigma: tuple[float, ...] = Field(max_length=16)
+    refined: bool  # whether the map was made with the fitted one
+
+
 class PartRecord(_Model):
     """One content-addressed binary part; a cell part also names its 128 m UTM cell.
 
@@ -190,10 +201,16 @@ class Quality(_Model):
     gnss_mode: Literal["none", "mapping", "final", "full"]
     publishable: bool
     warnings: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()  # worth knowing, but no reason not to publish
+    calibration: CalibrationRecord | None = None
     position_sigma_m: float | None = None  # horizontal, worst direction; median of the keyframes
     position_sigma_p95_m: float | None = None  # 95 % of the keyframes are better
     height_sigma_m: float | None = None  # median of the keyframes
     gnss_residual_sigmas: float | None = None  # median of the fixes
+    gnss_fixes_rejected: Total = 0  # far off though they claimed to be good
+    clock_offset_s: float | None = None  # the camera's stamps minus the receiver's, as estimated from the drive
+    clock_offset_sigma_s: float | None = None
+    clock_offset_removed: bool = False
     landmarks_per_m: float | None = None
     weak_length_m: float | None = None
     weak_stretches: tuple[WeakStretch, ...] = Field(default=(), max_length=MAX_PARTS)

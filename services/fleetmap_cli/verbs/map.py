@@ -8,12 +8,12 @@ from pathlib import Path
 
 import click
 
-from fleetmap.manifest import Manifest
+from fleetmap.manifest import CalibrationRecord, Manifest
 from fleetmap.transport import DEFAULT_ENDPOINT
 from fleetmap_cli.mapping import DriveChoice, map_and_publish, map_recording
 from fleetmap_cli.options import XYZ
 from fleetmap_cli.watching import stop_on_signals, watch_folder
-from fleetmap_mapper.settings import GnssGroup, GnssMode, MapperSettings
+from fleetmap_mapper.settings import CalibrationGroup, GnssGroup, GnssMode, MapperSettings
 
 _PATH = click.Path(path_type=Path)
 _FILE = click.Path(path_type=Path, dir_okay=False)
@@ -29,8 +29,8 @@ _UNFIT = 3
     type=click.Choice(["none", "mapping", "final", "full"]),
     default="full",
     show_default=True,
-    help="How fixes shape the map: 'none' places plain SLAM with one Sim(3) at the end; 'mapping' also aligns while "
-    "mapping; 'final' is 'none' with a joint adjustment at the end; 'full' does both.",
+    help="How fixes shape the map: 'none' places plain SLAM with one Sim(3) at the end; 'mapping' also aligns "
+    "while mapping; 'final' is 'none' with a joint adjustment at the end; 'full' does both.",
 )
 @click.option("--map-id", metavar="ID", help="The map's id in the catalogue.  [default: the output folder's name]")
 @click.option("--image-topic", metavar="TOPIC", help="Which camera, where the recording holds several.")
@@ -45,6 +45,12 @@ _UNFIT = 3
     type=_FILE,
     metavar="MASK.png",
     help="Use only what is white in this picture of the images' size; black hides the own bonnet, for example.",
+)
+@click.option(
+    "--refine-calibration",
+    is_flag=True,
+    help="Estimate focal length, centre and lens distortion together with the map; what the drive does not "
+    "determine (nearly all of it on a straight road) stays as recorded.",
 )
 @click.option(
     "--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True, help="Of all random draws."
@@ -66,6 +72,7 @@ def map_(
     gnss_topic: str | None,
     antenna_offset: tuple[float, float, float] | None,
     mask: Path | None,
+    refine_calibration: bool,
     seed: int,
     force: bool,
     verbose: bool,
@@ -84,7 +91,11 @@ def map_(
     """
     if verbose:
         logging.getLogger("fleetmap_mapper").setLevel(logging.INFO)
-    settings = MapperSettings(seed=seed, gnss=GnssGroup(mode=gnss))
+    if refine_calibration and gnss not in ("final", "full"):
+        raise click.UsageError("--refine-calibration needs the joint adjustment: --gnss final or --gnss full")
+    settings = MapperSettings(
+        seed=seed, gnss=GnssGroup(mode=gnss), calibration=CalibrationGroup(refine=refine_calibration)
+    )
     choice = DriveChoice(image_topic, gnss_topic, antenna_offset, mask)
     if watch is not None:
         if recording or output or trajectory or map_id or force:
@@ -113,6 +124,22 @@ def map_(
     return _report(manifest, output)
 
 
+def _refinement(calibration: CalibrationRecord) -> str:
+    before, after = calibration.recorded, calibration.fitted
+    sigma_px = calibration.centre_sigma_px
+    lens = ", ".join(
+        f"{old:.4f} -> {new:.4f} +- {sigma:.4f}"
+        for old, new, sigma in zip(before.distortion, after.distortion, calibration.distortion_sigma, strict=True)
+    )
+    return (
+        f"fx {before.fx_px:.1f} -> {after.fx_px:.1f} +- {calibration.focal_sigma_px:.1f} px, "
+        f"fy {before.fy_px:.1f} -> {after.fy_px:.1f} +- {calibration.focal_sigma_px:.1f} px, "
+        f"cx {before.cx_px:.1f} -> {after.cx_px:.1f} +- {sigma_px[0]:.1f} px, "
+        f"cy {before.cy_px:.1f} -> {after.cy_px:.1f} +- {sigma_px[1]:.1f} px, "
+        f"{after.distortion_model} {lens}"
+    )
+
+
 def _report(manifest: Manifest, output: Path) -> int:
     quality = manifest.quality
     residual = quality.gnss_residual_rms_m
@@ -124,7 +151,9 @@ def _report(manifest: Manifest, output: Path) -> int:
         click.echo(
             f"GNSS residual: {residual:.3f} m RMS over {quality.gnss_fixes} fixes (--gnss {quality.gnss_mode})"
         )
-    for warning in quality.warnings:
+    if quality.calibration is not None and quality.calibration.refined:
+        click.echo(f"calibration:   refined, {_refinement(quality.calibration)}")
+    for warning in (*quality.warnings, *quality.remarks):
         click.echo(f"warning: {warning}", err=True)
     if not quality.publishable:
         click.echo("warning: this map should not be published", err=True)
