@@ -26,6 +26,7 @@ VERBS: dict[str, tuple[str, str, str]] = {
     "simulate": ("simulate:simulate", "Simulate a drive with the truth known.", "simulation"),
     "info": ("info:info", "Say what a recording holds and whether it is good enough to map.", "recordings"),
     "map": ("map:map_", "Turn a survey drive into a map anchored in UTM.", "mapper"),
+    "report": ("report:report", "Draw how good a map is along its road.", "all"),
     "serve": ("serve:serve", "Run the map server (Zenoh and HTTP).", "server"),
     "publish": ("publish:publish", "Send a map to the server.", "server"),
     "maps": ("maps:maps", "List the maps of a server.", "server"),
