@@ -13,6 +13,7 @@ from fleetmap.transport import DEFAULT_ENDPOINT
 from fleetmap_cli.mapping import DriveChoice, map_and_publish, map_recording
 from fleetmap_cli.options import XYZ
 from fleetmap_cli.watching import stop_on_signals, watch_folder
+from fleetmap_mapper.setting_assignments import with_assignments
 from fleetmap_mapper.settings import CalibrationGroup, GnssGroup, GnssMode, MapperSettings
 
 _PATH = click.Path(path_type=Path)
@@ -53,6 +54,14 @@ _UNFIT = 3
     "determine (nearly all of it on a straight road) stays as recorded.",
 )
 @click.option(
+    "--set",
+    "assignments",
+    multiple=True,
+    metavar="GROUP.NAME=VALUE",
+    help="Change one setting of the mapper, such as a limit of the quality check; may be given several times, and "
+    "has the last word.  'fleetmap report' lists the quality settings of a map.",
+)
+@click.option(
     "--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True, help="Of all random draws."
 )
 @click.option("--force", is_flag=True, help="Replace an existing output.")
@@ -73,6 +82,7 @@ def map_(
     antenna_offset: tuple[float, float, float] | None,
     mask: Path | None,
     refine_calibration: bool,
+    assignments: tuple[str, ...],
     seed: int,
     force: bool,
     verbose: bool,
@@ -87,15 +97,17 @@ def map_(
     \b
     Examples:
       fleetmap map survey.mcap --output my_map --trajectory survey.tum
+      fleetmap map survey.mcap --output my_map --set quality.min_posed_ratio=0.9
       fleetmap map --watch drives --server tcp/127.0.0.1:7447
     """
     if verbose:
         logging.getLogger("fleetmap_mapper").setLevel(logging.INFO)
-    if refine_calibration and gnss not in ("final", "full"):
-        raise click.UsageError("--refine-calibration needs the joint adjustment: --gnss final or --gnss full")
     settings = MapperSettings(
         seed=seed, gnss=GnssGroup(mode=gnss), calibration=CalibrationGroup(refine=refine_calibration)
     )
+    settings = with_assignments(settings, assignments)
+    if settings.calibration.refine and settings.gnss.mode not in ("final", "full"):
+        raise click.UsageError("--refine-calibration needs the joint adjustment: --gnss final or --gnss full")
     choice = DriveChoice(image_topic, gnss_topic, antenna_offset, mask)
     if watch is not None:
         if recording or output or trajectory or map_id or force:
@@ -150,6 +162,20 @@ def _report(manifest: Manifest, output: Path) -> int:
     if residual is not None:
         click.echo(
             f"GNSS residual: {residual:.3f} m RMS over {quality.gnss_fixes} fixes (--gnss {quality.gnss_mode})"
+        )
+    if quality.gnss_fixes_rejected:
+        click.echo(f"GNSS outliers: {quality.gnss_fixes_rejected} fixes are far off and left out")
+    if quality.clock_offset_removed and quality.clock_offset_s is not None:
+        click.echo(
+            f"clock offset:  camera {quality.clock_offset_s:+.3f} s from the receiver "
+            f"(+- {quality.clock_offset_sigma_s:.3f} s), removed"
+        )
+    if quality.position_sigma_m is not None:
+        click.echo(f"uncertainty:   {quality.position_sigma_m:.3f} m (horizontal, 1 sigma, median)")
+    if quality.weak_stretches:
+        click.echo(
+            f"weak:          {quality.weak_length_m:.0f} m in {len(quality.weak_stretches)} stretches; "
+            f"'fleetmap report {output}' shows them"
         )
     if quality.calibration is not None and quality.calibration.refined:
         click.echo(f"calibration:   refined, {_refinement(quality.calibration)}")
