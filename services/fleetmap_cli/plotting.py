@@ -69,6 +69,36 @@ def plot_evaluation(
     save_figure(figure, path)
 
 
+@dataclass(frozen=True)
+class Sheet:
+    """One drive as several runs of it saw it."""
+
+    title: str
+    tracks: Sequence[Track]
+    lines: Sequence[ErrorLine]
+
+
+def plot_sheets(path: Path, sheets: Sequence[Sheet]) -> None:
+    """A column a drive: the trajectories from above, and below, on a scale of powers, their errors along the road.
+
+    Raises:
+        InputError: the file name's ending is no picture format.
+        StorageError: the picture cannot be written.
+    """
+    require_picture_name(path)
+    figure = new_figure(width_in=6.0 * len(sheets), height_in=9.0)
+    axes = figure.subplots(2, len(sheets), squeeze=False, height_ratios=[1.2, 1.0])
+    for (above, errors), sheet in zip(axes.T, sheets, strict=True):
+        draw_from_above(above, sheet.tracks)
+        above.set_title(sheet.title)
+        draw_errors(errors, sheet.lines)
+        smallest_m = min(float(line.judgement.errors.distances_m.min()) for line in sheet.lines)
+        errors.set_ylim(bottom=max(smallest_m, 1e-3))
+        errors.set_yscale("log")
+        errors.set_xlabel("way driven along the reference (m)")
+    save_figure(figure, path)
+
+
 def new_figure(width_in: float, height_in: float) -> Figure:
     """An empty figure on an Agg canvas."""
     figure = Figure(figsize=(width_in, height_in), dpi=120, layout="constrained")

@@ -1,4 +1,4 @@
-"""A benchmark's results as one Markdown table and one JSON file, written anew after every row."""
+"""A benchmark's results as Markdown tables and one JSON file, written anew after every row."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 from fleetmap.files import write_text_atomically
 from fleetmap_cli.benchmarks.machine import machine, versions
-from fleetmap_cli.benchmarks.row import Benchmark, Figures, Outcome, Value
+from fleetmap_cli.benchmarks.row import Benchmark, Figures, Group, Outcome, Value
 
 
 def write_report(folder: Path, benchmark: Benchmark, outcomes: Sequence[Outcome]) -> None:
@@ -27,10 +27,13 @@ def as_json(benchmark: Benchmark, outcomes: Sequence[Outcome]) -> dict[str, obje
         "rows": [
             {
                 "name": outcome.name,
+                "group": outcome.group.title if outcome.group else None,
                 "about": outcome.about,
                 "status": outcome.status,
                 "reason": outcome.reason,
                 "figures": outcome.figures,
+                "lines": outcome.lines,
+                "reach": outcome.reach,
                 "commands": list(outcome.commands),
                 "pictures": list(outcome.pictures),
                 "duration_s": round(outcome.duration_s, 1),
@@ -41,11 +44,11 @@ def as_json(benchmark: Benchmark, outcomes: Sequence[Outcome]) -> dict[str, obje
 
 
 def markdown(benchmark: Benchmark, outcomes: Sequence[Outcome]) -> str:
-    """The table, the rows without figures, the pictures, and the machine."""
-    parts = [f"# {benchmark.name}: {benchmark.about}", table(benchmark, outcomes)]
+    """The tables, the rows without figures, the pictures, and the machine."""
+    parts = [f"# {benchmark.name}: {benchmark.about}", tables(benchmark, outcomes)]
     if lines := [missing_line(outcome) for outcome in outcomes if outcome.status != "measured"]:
         parts.append("\n".join(f"* {line}" for line in lines))
-    if pictures := [name for outcome in outcomes for name in outcome.pictures]:
+    if pictures := dict.fromkeys(name for outcome in outcomes for name in outcome.pictures):
         parts.append("\n\n".join(f"![{Path(name).stem}]({name})" for name in pictures))
     facts = [f"{name}: {text}" for name, text in machine().items()]
     facts.append(", ".join(f"{name} {text}" for name, text in versions().items()))
@@ -53,20 +56,47 @@ def markdown(benchmark: Benchmark, outcomes: Sequence[Outcome]) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def table(benchmark: Benchmark, outcomes: Sequence[Outcome]) -> str:
-    """One line a measured or failed row, and the commands that make it."""
-    own_columns = [name for name in benchmark.columns if any(name in outcome.figures for outcome in outcomes)]
-    has_others = any(set(outcome.figures) - set(own_columns) for outcome in outcomes)
-    head = ["row", *own_columns, *(["figures"] if has_others else []), "command"]
+def tables(benchmark: Benchmark, outcomes: Sequence[Outcome]) -> str:
+    """One table, whose lines end with the commands that make them; or one a group, and all commands behind."""
+    told = [outcome for outcome in outcomes if outcome.status != "skipped"]
+    groups = list(dict.fromkeys(outcome.group for outcome in told if outcome.group is not None))
+    if not groups:
+        return _table("row", benchmark.columns, told, with_commands=True)
+    parts = [_group_table(group, [o for o in told if o.group == group]) for group in groups]
+    return "\n\n".join([*parts, "## Commands", *map(_commands, told)])
+
+
+def _group_table(group: Group, outcomes: Sequence[Outcome]) -> str:
+    table = _table("", group.columns, outcomes, with_commands=False)
+    return "\n\n".join(part for part in (f"## {group.title}", group.about, table) if part)
+
+
+def _table(corner: str, columns: Sequence[str], outcomes: Sequence[Outcome], *, with_commands: bool) -> str:
+    """One line for a row's own figures, and one for each of those beside them."""
+    every = [figures for outcome in outcomes for figures in (outcome.figures, *outcome.lines.values())]
+    own_columns = [name for name in columns if any(name in figures for figures in every)]
+    head = [corner, *own_columns]
+    has_others = any(set(figures) - set(own_columns) for figures in every)
+    has_others |= any(outcome.status == "failed" for outcome in outcomes) and not with_commands
+    head += ["figures"] * has_others
+    has_reach = any(outcome.reach for outcome in outcomes)
+    head += ["reach"] * has_reach + ["command"] * with_commands
     lines = [head, ["---"] * len(head)]
     for outcome in outcomes:
-        if outcome.status == "skipped":
-            continue
         others = _others(outcome.figures, own_columns) if outcome.status == "measured" else "failed"
-        cells = [shown(outcome.figures.get(name)) for name in own_columns]
         commands = "<br>".join(f"`{command}`" for command in outcome.commands)
-        lines.append([f"**{outcome.name}**: {outcome.about}", *cells, *([others] if has_others else []), commands])
+        tail = [others] * has_others + [outcome.reach] * has_reach + [commands] * with_commands
+        cells = [shown(outcome.figures.get(name)) for name in own_columns]
+        lines.append([f"**{outcome.name}**: {outcome.about}", *cells, *tail])
+        for label, figures in outcome.lines.items():
+            cells = [shown(figures.get(name)) for name in own_columns]
+            tail = [_others(figures, own_columns)] * has_others + [""] * (len(tail) - has_others)
+            lines.append([label, *cells, *tail])
     return "\n".join(f"| {' | '.join(cell.replace('|', '/') for cell in line)} |" for line in lines)
+
+
+def _commands(outcome: Outcome) -> str:
+    return "\n".join([f"**{outcome.name}**", "", *(f"    {command}" for command in outcome.commands)])
 
 
 def missing_line(outcome: Outcome) -> str:

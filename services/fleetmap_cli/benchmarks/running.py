@@ -45,11 +45,13 @@ def run_benchmark(
     except OSError as error:
         raise StorageError(f"cannot write {output}: {error.strerror or error}") from error
     outcomes: list[Outcome] = []
-    for number, row in enumerate(rows, start=1):
-        tell(f"[{number}/{len(rows)}] {row.name}: {row.about}")
-        outcomes.append(_measured(row, data, output))
-        tell(f"[{number}/{len(rows)}] {row.name}: {_summary(outcomes[-1])}")
-        write_report(output, benchmark, outcomes)
+    with tempfile.TemporaryDirectory(prefix=".work-", dir=output) as work:
+        shared = Workbench(data.resolve(), Path(work), output.resolve()) if benchmark.shares_work else None
+        for number, row in enumerate(rows, start=1):
+            tell(f"[{number}/{len(rows)}] {row.name}: {row.about}")
+            outcomes.append(_outcome(row, data, output, shared))
+            tell(f"[{number}/{len(rows)}] {row.name}: {_summary(outcomes[-1])}")
+            write_report(output, benchmark, outcomes)
     return outcomes
 
 
@@ -61,32 +63,42 @@ def _chosen(benchmark: Benchmark, names: Sequence[str]) -> list[Row]:
     return [row for row in benchmark.rows if not names or row.name in names]
 
 
-def _measured(row: Row, data: Path, output: Path) -> Outcome:
-    """One row's outcome; its recordings and maps are removed again."""
+def _outcome(row: Row, data: Path, output: Path, shared: Workbench | None) -> Outcome:
+    """What comes of one row; without a shared workbench its recordings and maps are removed again."""
     missing = [f"DATA/{place}" for place in row.needs if not (data / place).exists()]
     if missing:
-        return Outcome(row.name, row.about, "skipped", reason=f"needs {' and '.join(missing)}")
+        reason = f"needs {' and '.join(missing)}"
+        return Outcome(row.name, row.about, "skipped", reason=reason, group=row.group, reach=row.reach)
+    if shared is not None:
+        return _measured(row, Workbench(shared.data, shared.folder, shared.output, finished=shared.finished))
+    with tempfile.TemporaryDirectory(prefix=".work-", dir=output) as folder:
+        return _measured(row, Workbench(data.resolve(), Path(folder), output.resolve()))
+
+
+def _measured(row: Row, bench: Workbench) -> Outcome:
     started = time.perf_counter()
     figures: Figures = {}
     status: Status = "measured"
     reason = ""
-    with tempfile.TemporaryDirectory(prefix=".work-", dir=output) as folder:
-        bench = Workbench(data.resolve(), Path(folder), output.resolve())
-        try:
-            figures = row.measure(bench)
-        except CannotMeasureHereError as error:
-            status, reason = "skipped", str(error)
-        except FleetmapError as error:
-            status, reason = "failed", str(error)
+    try:
+        figures = row.measure(bench)
+    except CannotMeasureHereError as error:
+        status, reason = "skipped", str(error)
+    except FleetmapError as error:
+        status, reason = "failed", str(error)
+    is_measured = status == "measured"
     return Outcome(
         row.name,
         row.about,
         status,
         commands=tuple(bench.commands),
         figures=figures,
+        lines=bench.lines if is_measured else {},
         reason=reason,
-        pictures=tuple(bench.pictures) if status == "measured" else (),
+        pictures=tuple(bench.pictures) if is_measured else (),
         duration_s=time.perf_counter() - started,
+        group=row.group,
+        reach=row.reach,
     )
 
 

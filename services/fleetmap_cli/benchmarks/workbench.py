@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from fleetmap.errors import RunError
+from fleetmap_cli.benchmarks.row import Figures
 
 _FLEETMAP = (sys.executable, "-P", "-c", "from fleetmap_cli.main import main; main()")
 _DATA = "DATA/"
@@ -26,6 +27,7 @@ class Run:
     """A command that ended well."""
 
     stdout: str
+    stderr: str
     duration_s: float
 
     def json(self) -> Any:
@@ -42,6 +44,16 @@ class Workbench:
     output: Path  # pictures go here
     commands: list[str] = field(default_factory=list)
     pictures: list[str] = field(default_factory=list)
+    lines: dict[str, Figures] = field(default_factory=dict)
+    finished: dict[str, Run] = field(default_factory=dict)  # by ``once``, of all rows that share the folder
+
+    def once(self, command: str, *, accepted_codes: tuple[int, ...] = (0,)) -> Run:
+        """Like ``fleetmap``; but what an earlier row has run in the same folder is shown, and not run again."""
+        if command not in self.finished:
+            self.finished[command] = self.fleetmap(command, accepted_codes=accepted_codes)
+        elif f"fleetmap {command}" not in self.commands:
+            self.shown(f"fleetmap {command}")
+        return self.finished[command]
 
     def fleetmap(self, command: str, *, accepted_codes: tuple[int, ...] = (0,)) -> Run:
         """Run ``fleetmap COMMAND`` in a process of its own; words that begin with DATA/ lie in the data folder.
@@ -61,6 +73,10 @@ class Workbench:
         """Name a command that the row's figures come from without running it: the benchmark's own."""
         self.commands.append(command)
 
+    def beside(self, label: str, figures: Figures) -> None:
+        """Add a line to the row's table below its own figures."""
+        self.lines[label] = figures
+
     def picture(self, name: str) -> Path:
         """Where to write a picture that belongs to the row."""
         self.pictures.append(name)
@@ -78,4 +94,4 @@ class Workbench:
             said = [line for line in done.stderr.strip().splitlines() if line.strip()]
             reason = said[-1].replace(str(self.data), "DATA") if said else "it said nothing"
             raise RunError(f"'fleetmap {name.split()[0]}' ended with exit code {done.returncode}: {reason}")
-        return Run(done.stdout, duration_s)
+        return Run(done.stdout, done.stderr, duration_s)

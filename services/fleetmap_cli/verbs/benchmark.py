@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from fleetmap_cli.benchmarks.report import missing_line, table
+from fleetmap_cli.benchmarks.report import missing_line, tables
 from fleetmap_cli.benchmarks.row import Benchmark
 from fleetmap_cli.benchmarks.running import run_benchmark
 from fleetmap_cli.demo_processes import interrupted_once
@@ -71,7 +71,7 @@ def benchmark(
             chosen, data, folder, row_names=names, force=force, tell=lambda line: click.echo(line, err=True)
         )
     if any(outcome.status != "skipped" for outcome in outcomes):
-        click.echo(table(chosen, outcomes))
+        click.echo(tables(chosen, outcomes))
     for outcome in outcomes:
         if outcome.status != "measured":
             click.echo(missing_line(outcome))

@@ -9,7 +9,7 @@ import socket
 from pathlib import Path
 
 from fleetmap_cli.benchmarks.machine import machine, versions
-from fleetmap_cli.benchmarks.report import table, write_report
+from fleetmap_cli.benchmarks.report import tables, write_report
 from fleetmap_cli.benchmarks.row import Benchmark, Outcome
 
 BENCHMARK = Benchmark("tiny", "nothing much", (), columns=("mean m", "never measured"))
@@ -33,7 +33,7 @@ def cells(line):
 
 
 def test_the_table_has_a_line_a_row_and_the_columns_that_are_filled():
-    lines = table(BENCHMARK, OUTCOMES).splitlines()
+    lines = tables(BENCHMARK, OUTCOMES).splitlines()
     assert cells(lines[0]) == ["row", "mean m", "figures", "command"]
     assert cells(lines[1]) == ["---"] * 4
     assert cells(lines[2]) == [
@@ -49,7 +49,7 @@ def test_the_table_has_a_line_a_row_and_the_columns_that_are_filled():
 def test_the_files_say_all_and_name_neither_host_nor_paths(tmp_path):
     write_report(tmp_path, BENCHMARK, OUTCOMES)
     text, content = (tmp_path / "tiny.md").read_text(), json.loads((tmp_path / "tiny.json").read_text())
-    assert table(BENCHMARK, OUTCOMES) in text
+    assert tables(BENCHMARK, OUTCOMES) in text
     assert "* skipped: three, needs DATA/drives/elsewhere\n" in text
     assert "* failed: two, it said why\n" in text
     assert "![one](one.png)" in text
