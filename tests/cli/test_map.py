@@ -56,6 +56,7 @@ def test_help_teaches(fleetmap):
         "--gnss",
         "[none|mapping|final|full]",
         "--watch",
+        "--set",
         "exit code 3",
         "Examples:",
     ):
@@ -119,11 +120,19 @@ def test_force_does_not_replace_what_is_no_map(fleetmap, short_drive, tmp_path):
 
 
 def test_a_map_that_is_unfit_is_written_and_told_with_exit_code_3(fleetmap, patchy_drive, tmp_path):
-    code, out, err = fleetmap("map", patchy_drive, "--output", tmp_path / "patchy", "--gnss", "final")
+    arguments = ["--gnss", "final", "--set", "quality.max_unposed_gap_s=0.5"]
+    code, out, err = fleetmap("map", patchy_drive, "--output", tmp_path / "patchy", *arguments)
     assert code == 3
     assert "images posed:  32 of 40" in out
-    assert err == "warning: only 32 of 40 images could be posed\nwarning: this map should not be published\n"
+    assert err.splitlines() == [
+        "warning: only 32 of 40 images could be posed",
+        "warning: no image is posed for 0.9 s in mid-drive (limit 0.5 s)",
+        "warning: this map should not be published",
+    ]
     manifest = open_package(tmp_path / "patchy").manifest
+    (weak,) = manifest.quality.weak_stretches
+    assert "gap" in [reason.kind for reason in weak.reasons]
+    assert 13.0 < weak.from_m < weak.to_m < 25.0  # images 19 to 28 of a drive of 0.8 m an image
     assert not manifest.quality.publishable
     assert manifest.quality.gnss_mode == manifest.provenance.settings["gnss"]["mode"] == "final"
 
@@ -157,6 +166,8 @@ def test_an_antenna_behind_and_to_the_right_is_given_with_a_leading_minus(
         (["drive.mcap", "--output", "m", "--trajectory", "."], "is a directory"),
         (["drive.mcap", "--output", "m", "--map-id", "Köln 1"], "'Köln 1' cannot be a map id"),
         (["drive.mcap", "--output", "ß"], "no map id can be made of 'ß'; give one with --map-id"),
+        (["drive.mcap", "--output", "m", "--set", "quality.posed=1"], "no mapper setting 'quality.posed'"),
+        (["drive.mcap", "--output", "m", "--set", "quality.weak_ties=x"], "'quality.weak_ties' cannot be 'x'"),
         (["drive.mcap", "--output", "m"], "there is no recording drive.mcap"),
     ],
 )
