@@ -235,7 +235,7 @@ def _agree(wanted: int, counted: dict[str, int], origin: str) -> None:
 def _encode(
     visual_map: VisualMap, map_id: str, quality: Quality, provenance: Provenance, road_quality: RoadQuality | None
 ) -> tuple[list[bytes], Manifest]:
-    """All parts, cells in order, the full one and the quality, and the manifest that lists them in this order."""
+    """All parts, and the manifest that lists them in the same order."""
     origin = f"map '{map_id}'"
     check_visual_map(visual_map, origin)
     keyframes, landmarks = visual_map.keyframes, visual_map.landmarks
@@ -244,16 +244,9 @@ def _encode(
     _agree(quality.keyframes, {"keyframes": len(keyframes)}, origin)
     _agree(quality.landmarks, {"landmarks": len(landmarks)}, origin)
     _agree(quality.observations, {"observations": len(visual_map.observations)}, origin)
-    parts, records = [], []
-    for index, cell in split_into_cells(visual_map).items():
-        parts.append(encode_cell(index, cell, visual_map.anchor))
-        records.append(_record("cell", parts[-1], len(cell.keyframe_ids), len(cell.landmark_ids), index))
-    parts.append(encode_full(visual_map))
-    records.append(_record("full", parts[-1], len(keyframes), len(landmarks), None))
     if road_quality is not None:
         _agree(quality.keyframes, {"keyframes along the road": len(road_quality.keyframes)}, origin)
-        parts.append(encode_quality(road_quality, visual_map.anchor))
-        records.append(_record("quality", parts[-1], len(road_quality.keyframes), 0, None))
+    parts, records = _encode_parts(visual_map, road_quality)
     lonlat = keyframes_lonlat(visual_map.anchor, keyframes)
     fields = {
         "map_id": map_id,
@@ -267,6 +260,22 @@ def _encode(
         "provenance": provenance,
     }
     return parts, make_manifest(fields, origin)
+
+
+def _encode_parts(
+    visual_map: VisualMap, road_quality: RoadQuality | None
+) -> tuple[list[bytes], list[dict[str, object]]]:
+    """Cells in order, the full part, and the quality part where there is one; each with its record."""
+    parts, records = [], []
+    for index, cell in split_into_cells(visual_map).items():
+        parts.append(encode_cell(index, cell, visual_map.anchor))
+        records.append(_record("cell", parts[-1], len(cell.keyframe_ids), len(cell.landmark_ids), index))
+    parts.append(encode_full(visual_map))
+    records.append(_record("full", parts[-1], len(visual_map.keyframes), len(visual_map.landmarks), None))
+    if road_quality is not None:
+        parts.append(encode_quality(road_quality, visual_map.anchor))
+        records.append(_record("quality", parts[-1], len(road_quality.keyframes), 0, None))
+    return parts, records
 
 
 def _record(
