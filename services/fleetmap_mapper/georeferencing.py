@@ -133,7 +133,7 @@ def georeference(path: Sequence[PathPoint], track: GnssTrack, level_sigma_deg: f
 
     first = _umeyama_with_lever_arm(positions, rotations, targets, track.antenna_in_cam_m)
     cost, S = fitted(first)
-    upright_cost, upright = fitted(_levelled(first, positions, rotations))
+    upright_cost, upright = fitted(levelled(first, positions, rotations))
     # On a straight road a world turned upside down fits as well: only clear evidence may speak for it.
     least, ratio = CLEAR_EVIDENCE
     return S if least + ratio * cost < upright_cost else upright
@@ -162,8 +162,11 @@ def _umeyama_with_lever_arm(positions: Array, rotations: Array, targets: Array, 
     return S
 
 
-def _levelled(S: Sim3, positions: Array, rotations: Array) -> Sim3:
-    """Turn about the main direction of the track so that the cameras' mean "down" points down."""
+def levelled(S: Sim3, positions: Array, rotations: Array) -> Sim3:
+    """``map_from_vis`` turned about the main direction of the track until the cameras' mean "down" points down.
+
+    Positions (N, 3) and rotations (N, 3, 3) of the cameras are those in vis.
+    """
     placed = S.transform(positions)
     centre = placed.mean(axis=0)
     axis = np.linalg.svd(placed - centre, full_matrices=False)[2][0]

@@ -18,7 +18,9 @@ from fleetmap.road_quality import RoadQuality
 from fleetmap.trajectory import Trajectory
 from fleetmap.visual_map import VisualMap
 from fleetmap_mapper.alignment import GnssAligner
+from fleetmap_mapper.drift_path import Timed
 from fleetmap_mapper.drive_slam import run_slam
+from fleetmap_mapper.fix_screening import screen_fixes, with_screening
 from fleetmap_mapper.georeferenced_map import adjust_with_fixes, place, pose_frames, without_outliers
 from fleetmap_mapper.georeferencing import GnssTrack, georeference, gnss_track, path_at_fixes
 from fleetmap_mapper.image_mask import ImageMask
@@ -64,6 +66,9 @@ def map_drive(
     _report_speed(sum(len(s.posed) for s in segments), time.perf_counter() - start_s, times)
 
     progress("placing the map", 0, 1)
+    paths = [Timed.of(_stamps(s.posed), [p.vis_from_cam for p in s.posed]) for s in segments]
+    screened = screen_fixes(paths, track, settings.gnss, settings.seed)
+    track = screened.track
     joined, map_from_vis = _placed_segments(segments, track, settings)
     growing, posed = joined.growing, joined.posed
     placed = place(growing, Sim3.identity())
@@ -80,6 +85,7 @@ def map_drive(
     path = path_at_fixes(_stamps(posed), frames, track)
     road = measure_road(placed, trajectory, path, track, settings.quality.weak_gap_s)
     quality = assess(placed, road, len(trajectory), drive.frame_count, track.anchor, settings)
+    quality = with_screening(quality, screened)
     return MappedDrive(build_visual_map(placed, growing, track.anchor), trajectory, quality, road)
 
 

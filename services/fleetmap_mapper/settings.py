@@ -63,6 +63,8 @@ class GnssGroup(_Group):
     align_every: int = 5  # keyframes between two light alignments while mapping
     align_window: int = Field(default=300, ge=10)  # keyframes that such an alignment moves; older ones stay
     level_sigma_deg: float = 0.5  # how level the camera's horizontal axis is taken to be, averaged over a drive
+    reject_outliers: bool = True  # fixes that are metres off though they claim to be good
+    estimate_clock_offset: bool = True  # between camera and receiver; taken off where the drive proves it
 
 
 class CalibrationGroup(_Group):
