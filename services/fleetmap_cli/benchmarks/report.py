@@ -74,24 +74,24 @@ def _group_table(group: Group, outcomes: Sequence[Outcome]) -> str:
 def _table(corner: str, columns: Sequence[str], outcomes: Sequence[Outcome], *, with_commands: bool) -> str:
     """One line for a row's own figures, and one for each of those beside them."""
     every = [figures for outcome in outcomes for figures in (outcome.figures, *outcome.lines.values())]
-    own_columns = [name for name in columns if any(name in figures for figures in every)]
-    head = [corner, *own_columns]
-    has_others = any(set(figures) - set(own_columns) for figures in every)
-    has_others |= any(outcome.status == "failed" for outcome in outcomes) and not with_commands
-    head += ["figures"] * has_others
+    own = [name for name in columns if any(name in figures for figures in every)]
+    failed = any(outcome.status == "failed" for outcome in outcomes)
+    has_others = failed or any(set(figures) - set(own) for figures in every)
     has_reach = any(outcome.reach for outcome in outcomes)
-    head += ["reach"] * has_reach + ["command"] * with_commands
-    lines = [head, ["---"] * len(head)]
+    head = [*own, *["figures"] * has_others, *["reach"] * has_reach, *["command"] * with_commands]
+    lines = [[corner, *head], ["---"] * (1 + len(head))]
+
+    def add(label: str, figures: Figures, also: dict[str, str]) -> None:
+        cells = {name: shown(figures.get(name)) for name in own} | {"figures": _others(figures, own)} | also
+        lines.append([label, *(cells.get(name, "") for name in head)])
+
     for outcome in outcomes:
-        others = _others(outcome.figures, own_columns) if outcome.status == "measured" else "failed"
-        commands = "<br>".join(f"`{command}`" for command in outcome.commands)
-        tail = [others] * has_others + [outcome.reach] * has_reach + [commands] * with_commands
-        cells = [shown(outcome.figures.get(name)) for name in own_columns]
-        lines.append([f"**{outcome.name}**: {outcome.about}", *cells, *tail])
+        also = {"reach": outcome.reach, "command": "<br>".join(f"`{command}`" for command in outcome.commands)}
+        if outcome.status == "failed":
+            also["figures"] = "failed"
+        add(f"**{outcome.name}**: {outcome.about}", outcome.figures, also)
         for label, figures in outcome.lines.items():
-            cells = [shown(figures.get(name)) for name in own_columns]
-            tail = [_others(figures, own_columns)] * has_others + [""] * (len(tail) - has_others)
-            lines.append([label, *cells, *tail])
+            add(label, figures, {})
     return "\n".join(f"| {' | '.join(cell.replace('|', '/') for cell in line)} |" for line in lines)
 
 

@@ -39,19 +39,20 @@ _NAMES = ("drives", "mapper", "localizer", "server")
 def benchmark(
     name: str, data: Path, output: Path | None, rows: str | None, list_rows: bool, force: bool
 ) -> int | None:
-    """Measure NAME, and print one table whose rows show the commands that make them.
+    """Measure NAME, and print its table, or tables, with the commands that make each row.
 
     \b
       drives      is the simulated world as hard to see as a real one; rendering speed; a recording of
                   4 GB in bounded memory; what a spline through the fixes alone gives; clock offsets
-      mapper      maps of the real drives with each kind of GNSS, and without, against their references
-                  and beside a smoothing spline through the same fixes
+      mapper      maps of the real drives and of a simulated circuit: plain SLAM beside its peers, each
+                  kind of GNSS beside splines through the same fixes, bad fixes, what each use of the
+                  fixes gives, images a second; about an hour in all
       localizer   a second camera in the map of the first
       server      a map published and fetched over loopback, beside raw TCP
 
-    The table is also written as NAME.md, beside NAME.json and pictures, after every row: what is measured stays
+    The tables are also written as NAME.md, beside NAME.json and pictures, after every row: what is measured stays
     when a later row is interrupted. A row that fails says why, and the exit code is 1. Recordings and maps are
-    made in the output folder and removed again.
+    made in the output folder and removed again; what several rows need is made once.
 
     \b
     Examples:

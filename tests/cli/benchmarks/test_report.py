@@ -10,7 +10,7 @@ from pathlib import Path
 
 from fleetmap_cli.benchmarks.machine import machine, versions
 from fleetmap_cli.benchmarks.report import tables, write_report
-from fleetmap_cli.benchmarks.row import Benchmark, Outcome
+from fleetmap_cli.benchmarks.row import Benchmark, Group, Outcome
 
 BENCHMARK = Benchmark("tiny", "nothing much", (), columns=("mean m", "never measured"))
 OUTCOMES = [
@@ -44,6 +44,35 @@ def test_the_table_has_a_line_a_row_and_the_columns_that_are_filled():
     ]
     assert cells(lines[3]) == ["**two**: a row / that failed", "", "failed", "`fleetmap map nothing`"]
     assert len(lines) == 4
+
+
+def test_groups_have_tables_of_their_own_with_lines_beside_and_the_commands_come_last():
+    slow, fast = Group("Slow", "Read slowly.", ("mean m", "posed")), Group("Fast", "", ("images/s",))
+    peer = {"mean m": "0.2 to 0.3", "note": "theirs"}
+    outcomes = [
+        Outcome(
+            "one", "first", "measured", ("a",), {"mean m": 0.1}, {"peer": peer}, group=slow, reach="mean <= 0.1"
+        ),
+        Outcome("two", "second", "failed", ("a", "b"), reason="it said why", group=slow),
+        Outcome("three", "third", "measured", ("c",), {"images/s": 20.0}, group=fast),
+        Outcome("four", "fourth", "skipped", reason="needs DATA/x", group=Group("Absent", "", ())),
+    ]
+    blocks = tables(BENCHMARK, outcomes).split("\n\n")
+    assert blocks[:2] == ["## Slow", "Read slowly."]
+    assert [cells(line) for line in blocks[2].splitlines()] == [
+        ["", "mean m", "figures", "reach"],
+        ["---"] * 4,
+        ["**one**: first", "0.1", "", "mean <= 0.1"],
+        ["peer", "0.2 to 0.3", "note theirs", ""],
+        ["**two**: second", "", "failed", ""],
+    ]
+    assert blocks[3] == "## Fast"
+    assert [cells(line) for line in blocks[4].splitlines()] == [
+        ["", "images/s"],
+        ["---"] * 2,
+        ["**three**: third", "20"],
+    ]
+    assert blocks[5:] == ["## Commands", "**one**", "    a", "**two**", "    a\n    b", "**three**", "    c"]
 
 
 def test_the_files_say_all_and_name_neither_host_nor_paths(tmp_path):

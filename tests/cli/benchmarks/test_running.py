@@ -108,3 +108,25 @@ def test_exit_codes_that_are_accepted_are_no_failure(tmp_path):
     assert bench.fleetmap("info nothing.mcap", accepted_codes=(0, 2)).stdout == ""
     with pytest.raises(RunError, match=r"'fleetmap info' ended with exit code 2: error: "):
         bench.fleetmap("info nothing.mcap")
+
+
+def test_rows_that_share_their_work_run_a_command_once_and_all_show_it(tmp_path):
+    runs = []
+
+    def row(bench):
+        runs.append(bench.once("--version"))
+        assert bench.once("--version") is runs[-1]
+        bench.beside("of others", {"version": "2"})
+        (bench.folder / f"of-{len(runs)}").touch()
+        return {"files": len(list(bench.folder.iterdir()))}
+
+    rows = (Row("one", "", row), Row("two", "", row))
+    shared = run_benchmark(Benchmark("tiny", "", rows, shares_work=True), tmp_path, tmp_path / "shared")
+    assert runs[1] is runs[0]
+    assert [outcome.commands for outcome in shared] == [("fleetmap --version",)] * 2
+    assert [outcome.figures["files"] for outcome in shared] == [1, 2]
+    assert [outcome.lines for outcome in shared] == [{"of others": {"version": "2"}}] * 2
+    run_benchmark(Benchmark("tiny", "", rows), tmp_path, tmp_path / "apart")
+    assert runs[3] is not runs[2]
+    for folder in ("shared", "apart"):
+        assert sorted(path.name for path in (tmp_path / folder).iterdir()) == ["tiny.json", "tiny.md"]
