@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.files import write_text_atomically
-from fleetmap.manifest import Manifest, WeakStretch
+from fleetmap.manifest import Manifest, Quality, WeakStretch
 from fleetmap.map_package import open_package
 from fleetmap.road_quality import RoadQuality
 from fleetmap.visual_map import LocalizationMap
@@ -90,9 +90,13 @@ def summary(report: MapReport) -> Iterator[tuple[str, str]]:
     yield "verdict", "fit to publish" if quality.publishable else "not fit to publish"
     for warning in quality.warnings:
         yield "warning", warning
+    for remark in quality.remarks:
+        yield "remark", remark
     yield "images posed", f"{quality.frames_posed} of {quality.frames_total}; {quality.keyframes} keyframes"
     yield "position", _position(report)
     yield "GNSS residual", _gnss_residual(report)
+    if quality.clock_offset_s is not None:
+        yield "clock offset", _clock_offset(quality)
     density = (
         f"{quality.landmarks_per_m:.1f} per metre" if quality.landmarks_per_m is not None else "density unknown"
     )
@@ -148,6 +152,7 @@ def _along_the_road(road: RoadQuality) -> dict[str, Any]:
             "along_m": _numbers(fixes.along_m, 3),
             "residual_m": [_numbers(residual, 5) for residual in fixes.residuals_m],
             "residual_sigmas": _numbers(fixes.sigmas, 4),
+            "claimed_sigma_m": _numbers(fixes.claimed_sigmas_m, 5),
         },
         "steps": {"edge_m": _numbers(road.edges_m, 3), "landmarks_per_m": _numbers(road.landmarks_per_m, 3)},
         "gaps": {"stamp_ns": road.gap_stamps_ns.tolist(), "along_m": [_numbers(gap, 3) for gap in road.gaps_m]},
@@ -174,7 +179,14 @@ def _gnss_residual(report: MapReport) -> str:
     if quality.gnss_residual_rms_m is None:
         return "no fix lies between posed images"
     sigmas = "" if quality.gnss_residual_sigmas is None else f", median {quality.gnss_residual_sigmas:.1f} sigma"
-    return f"{quality.gnss_residual_rms_m:.3f} m RMS over {quality.gnss_fixes} fixes{sigmas}"
+    claimed = "" if quality.gnss_sigma_m is None else f"; the receiver claims {quality.gnss_sigma_m:.3f} m"
+    return f"{quality.gnss_residual_rms_m:.3f} m RMS over {quality.gnss_fixes} fixes{sigmas}{claimed}"
+
+
+def _clock_offset(quality: Quality) -> str:
+    sigma = "" if quality.clock_offset_sigma_s is None else f" +- {1e3 * quality.clock_offset_sigma_s:.0f} ms"
+    removed = "removed" if quality.clock_offset_removed else "left as it is"
+    return f"{1e3 * (quality.clock_offset_s or 0.0):.0f} ms{sigma} (camera minus receiver), {removed}"
 
 
 def _weak(report: MapReport) -> str:

@@ -20,7 +20,8 @@ td.number { text-align: right; white-space: nowrap; } img { width: 100%; height:
 """
 _NOTE = (
     "Uncertainties are 1 sigma and come from the final joint adjustment of images and fixes. What all fixes of "
-    "the drive err by together, such as the slow bias of one receiver, is not in them: one drive cannot see it."
+    "the drive err by together, such as the slow bias of one receiver, is not in them: one drive cannot see it. "
+    "How large that may be, the receiver's own claim tells."
 )
 
 
@@ -33,7 +34,7 @@ def page(report: MapReport, picture_png: bytes) -> str:
     blocks = [
         f"<h1>{title}</h1>",
         f'<p><span class="verdict {verdict[0]}">{verdict[1]}</span></p>',
-        _list(quality.warnings),
+        _list((*quality.warnings, *quality.remarks)),
         f'<p><img alt="The road from above and the figures along it" src="data:image/png;base64,{image}"></p>',
         "<h2>Figures</h2>",
         _table([(escape(label), escape(text)) for label, text in summary(report) if _is_figure(label)]),
@@ -51,7 +52,7 @@ def page(report: MapReport, picture_png: bytes) -> str:
 
 def _is_figure(label: str) -> bool:
     """Verdict, warnings and the single stretches have places of their own on the page."""
-    return label not in ("verdict", "warning") and not label.startswith(" ")
+    return label not in ("verdict", "warning", "remark") and not label.startswith(" ")
 
 
 def _list(texts: Sequence[str]) -> str:

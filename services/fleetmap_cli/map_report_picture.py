@@ -61,6 +61,7 @@ def _remarks(report: MapReport) -> str:
     """What speaks against the map, and its first weak stretches with their reasons."""
     quality = report.manifest.quality
     found = [f"Warning: {warning}" for warning in quality.warnings]
+    found += [f"Remark: {remark}" for remark in quality.remarks]
     for number, stretch in enumerate(quality.weak_stretches[:_STRETCHES_NAMED], start=1):
         reasons = "; ".join(reason.text for reason in stretch.reasons)
         found.append(f"Weak stretch {number}, {stretch.from_m:.0f} to {stretch.to_m:.0f} m: {reasons}")

@@ -46,6 +46,7 @@ def assess(
         position_sigma_p95_m=_percentile(horizontal_m, 95.0),
         height_sigma_m=_percentile(vertical_m, 50.0),
         gnss_residual_sigmas=_percentile(road.fixes.sigmas, 50.0),
+        gnss_sigma_m=_percentile(road.fixes.claimed_sigmas_m, 50.0),
         landmarks_per_m=round(len(placed.points_m) / road.length_m, 3),
         weak_length_m=round(sum(stretch.to_m - stretch.from_m for stretch in weak), 3),
         weak_stretches=weak,

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.road_quality import FixQuality, KeyframeQuality, RoadQuality
+from fleetmap.road_quality import FixQuality, KeyframeQuality, RoadQuality, horizontal_sigmas_m
 from fleetmap.trajectory import Trajectory
 from fleetmap_mapper.georeferenced_map import PlacedMap, reprojection_errors_px
 from fleetmap_mapper.georeferencing import GnssTrack, PathPoint
@@ -78,6 +78,7 @@ def _fix_quality(trajectory: Trajectory, path: Sequence[PathPoint], track: GnssT
         _along_m(trajectory, track.stamps_ns[fixes]),
         residuals_m.astype(np.float32),
         np.sqrt(whitened / 3.0).astype(np.float32),
+        horizontal_sigmas_m(track.covariances_m2[fixes]).astype(np.float32),
     )
 
 

@@ -207,6 +207,7 @@ class Quality(_Model):
     position_sigma_p95_m: float | None = None  # 95 % of the keyframes are better
     height_sigma_m: float | None = None  # median of the keyframes
     gnss_residual_sigmas: float | None = None  # median of the fixes
+    gnss_sigma_m: float | None = None  # horizontal, as the receiver states it; median of the fixes
     gnss_fixes_rejected: Total = 0  # far off though they claimed to be good
     clock_offset_s: float | None = None  # the camera's stamps minus the receiver's, as estimated from the drive
     clock_offset_sigma_s: float | None = None

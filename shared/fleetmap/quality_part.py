@@ -35,6 +35,7 @@ def encode_quality(quality: RoadQuality, anchor: UtmAnchor) -> bytes:
         "fix_along_m": fixes.along_m.astype("<f8"),
         "fix_residuals_m": fixes.residuals_m.astype("<f4"),
         "fix_sigmas": fixes.sigmas.astype("<f4"),
+        "fix_claimed_sigmas_m": fixes.claimed_sigmas_m.astype("<f4"),
         "step_edges_m": quality.edges_m.astype("<f8"),
         "step_landmarks_per_m": quality.landmarks_per_m.astype("<f4"),
         "gap_stamps_ns": quality.gap_stamps_ns.astype("<i8"),
@@ -101,6 +102,7 @@ def _read_fixes(part: Part) -> FixQuality:
         part.array("fix_along_m", "<f8", (count,)),
         part.array("fix_residuals_m", "<f4", (count, 3)),
         part.array("fix_sigmas", "<f4", (count,)),
+        part.array("fix_claimed_sigmas_m", "<f4", (count,)),
     )
 
 

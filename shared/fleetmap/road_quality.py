@@ -12,6 +12,13 @@ Array32 = NDArray[np.float32]
 Stamps = NDArray[np.int64]
 
 
+def horizontal_sigmas_m(covariances_m2: NDArray[np.floating]) -> Array:
+    """Sigma (N,) of positions with covariances (N, 3, 3) in their worst horizontal direction."""
+    east, north = covariances_m2[:, 0, 0].astype(np.float64), covariances_m2[:, 1, 1].astype(np.float64)
+    half_spread = np.hypot((east - north) / 2.0, covariances_m2[:, 0, 1])
+    return np.asarray(np.sqrt((east + north) / 2.0 + half_spread))
+
+
 @dataclass(frozen=True)
 class KeyframeQuality:
     """At each keyframe, in time order."""
@@ -29,9 +36,7 @@ class KeyframeQuality:
     @property
     def horizontal_sigmas_m(self) -> Array:
         """Sigma (K,) of the position in its worst horizontal direction; NaN where undetermined."""
-        east, north = self.covariances_m2[:, 0, 0].astype(np.float64), self.covariances_m2[:, 1, 1]
-        half_spread = np.hypot((east - north) / 2.0, self.covariances_m2[:, 0, 1])
-        return np.asarray(np.sqrt((east + north) / 2.0 + half_spread))
+        return horizontal_sigmas_m(self.covariances_m2)
 
     @property
     def vertical_sigmas_m(self) -> Array:
@@ -47,6 +52,7 @@ class FixQuality:
     along_m: Array  # (F,) float64
     residuals_m: Array32  # (F, 3) float32 east, north, up: the antenna as mapped minus the fix
     sigmas: Array32  # (F,) float32 RMS of the residual's three parts, each over its own sigma
+    claimed_sigmas_m: Array32  # (F,) float32 as the receiver states them, in the worst horizontal direction
 
     def __len__(self) -> int:
         return len(self.stamps_ns)

@@ -69,6 +69,7 @@ def road_of(package: MapPackage, sigma_m: float = 0.05) -> RoadQuality:
             along_m[::3],
             np.tile(np.array([[0.03, -0.04, 0.02]], np.float32), (len(along_m[::3]), 1)),
             np.linspace(0.5, 5.0, len(along_m[::3]), dtype=np.float32),
+            np.full(len(along_m[::3]), 0.05, np.float32),
         ),
         np.linspace(0.0, length_m, 16),
         np.full(15, 10.0, np.float32),

@@ -93,6 +93,7 @@ def test_residuals_are_the_map_minus_the_fix_in_metres_and_in_sigmas(straight):
     fixes = road_of(*straight, error_m=(0.1, -0.2, 0.4)).fixes
     np.testing.assert_allclose(fixes.residuals_m, np.tile([0.1, -0.2, 0.4], (len(fixes), 1)), atol=1e-6)
     np.testing.assert_allclose(fixes.sigmas, 1.0, atol=1e-6)
+    np.testing.assert_allclose(fixes.claimed_sigmas_m, 0.2, atol=1e-6)
 
 
 def test_reprojection_errors_and_landmarks_of_each_keyframe(straight):

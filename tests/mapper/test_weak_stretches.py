@@ -37,6 +37,7 @@ def sound_road() -> RoadQuality:
             fixes_m,
             np.full((len(fixes_m), 3), 0.03, np.float32),
             np.full(len(fixes_m), 0.8, np.float32),
+            np.full(len(fixes_m), 0.05, np.float32),
         ),
         np.linspace(0.0, LENGTH_M, 31),
         np.full(30, 80.0, np.float32),
@@ -145,9 +146,8 @@ def test_a_minute_of_standing_still_leaves_no_weak_road():
 def test_what_is_unknown_is_not_called_weak():
     road = sound_road()
     road.keyframes.covariances_m2[:] = np.nan
-    no_fixes = FixQuality(
-        np.empty(0, np.int64), np.empty(0), np.empty((0, 3), np.float32), np.empty(0, np.float32)
-    )
+    none = np.empty(0, np.float32)
+    no_fixes = FixQuality(np.empty(0, np.int64), np.empty(0), np.empty((0, 3), np.float32), none, none)
     road = replace(road, fixes=no_fixes)
     assert find_weak_stretches(road, TIES, LIMITS, ANCHOR, is_tied_to_fixes=True) == ()
 

@@ -44,6 +44,7 @@ def random_quality(keyframes: int = 30, fixes: int = 7, stamps_ns: np.ndarray | 
             np.sort(rng.uniform(0.0, 100.0, fixes)),
             rng.normal(0.0, 0.1, (fixes, 3)).astype(np.float32),
             rng.uniform(0.0, 3.0, fixes).astype(np.float32),
+            rng.uniform(0.01, 3.0, fixes).astype(np.float32),
         ),
         np.linspace(0.0, 100.0, 11),
         rng.uniform(0.0, 90.0, 10).astype(np.float32),
