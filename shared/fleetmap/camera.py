@@ -111,23 +111,17 @@ class Camera:
         return np.asarray(square <= np.tan(np.radians(WIDEST_ANGLE_DEG)) ** 2)
 
     def magnification(self, ideal_pixels: Array) -> Array:
-        """How far a recorded pixel's error is stretched, at most, by undistorting it: (N,) for pixels (N, 2).
+        """How far a recorded pixel's error is stretched by undistorting it: (N,) for undistorted pixels (N, 2).
 
-        The larger singular value of d undistorted / d recorded; 1 where nothing is distorted.
+        The root of |det d undistorted / d recorded|, so that an isotropic sigma keeps the information that the
+        pixel has; 1 where nothing is distorted. Off the axis of a wide lens errors grow more along the radius than
+        across it. The larger of the two stretches would waste what is known across, and let mismatches pass there.
         """
         if not self.has_distortion:
             return np.ones(len(ideal_pixels))
-        aspect = self.fx_px / self.fy_px
         J = jacobian(self.distortion_model, self.distortion, self.normalise(ideal_pixels))
-        a, b, c, d = J[:, 0, 0], J[:, 0, 1] * aspect, J[:, 1, 0] / aspect, J[:, 1, 1]
-        squares = a * a + b * b + c * c + d * d
-        # sigma_1 and sigma_2 of J: (sigma_1 +- sigma_2)^2 = squares +- 2 |det|; wanted is 1 / sigma_2.
-        determinant = np.abs(a * d - b * c)
-        larger = 0.5 * (
-            np.sqrt(squares + 2.0 * determinant) + np.sqrt(np.maximum(squares - 2.0 * determinant, 0.0))
-        )
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.asarray(larger / determinant)
+            return np.asarray(1.0 / np.sqrt(np.abs(J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0])))
 
     @cached_property
     def ideal_bounds_px(self) -> tuple[float, float, float, float]:

@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleetmap.camera import Camera
+from fleetmap.distortion import coefficient_jacobian, distort, jacobian
 from fleetmap.errors import CalibrationError
 
 KITTI = Camera(
@@ -144,3 +145,71 @@ def test_points_beyond_where_the_polynomial_turns_back_have_no_pixel(k1):
 def test_a_model_that_is_unknown_or_short_of_coefficients_is_refused(distortion, model):
     with pytest.raises(CalibrationError, match=model):
         Camera(640, 480, 500.0, 500.0, 319.5, 239.5, distortion, model)
+
+
+FISHEYE = Camera(960, 600, 420.0, 425.0, 483.0, 296.0, (0.02, -0.005, 0.001, 0.0), "equidistant")
+RATIONAL = Camera(
+    960, 600, 480.0, 470.0, 479.5, 299.5, (0.6, 0.05, 3e-4, -2e-4, 0.002, 0.95, 0.2, 0.01), "rational_polynomial"
+)
+LENSES = pytest.mark.parametrize("camera", [KITTI, RATIONAL, FISHEYE], ids=lambda c: c.distortion_model)
+
+
+def pixels_all_over(camera: Camera, count: int = 60) -> np.ndarray:
+    size = np.array([camera.width_px - 1.0, camera.height_px - 1.0])
+    pixels = np.random.default_rng(7).uniform(0.0, 1.0, (count, 2)) * size
+    return pixels[camera.is_within_reach(camera.undistort(pixels))]
+
+
+@LENSES
+def test_distorting_and_undistorting_pixels_are_inverses(camera):
+    pixels = pixels_all_over(camera)
+    ideal = camera.undistort(pixels)
+    assert np.abs(ideal - pixels).max() > 5.0
+    assert np.abs(camera.distort(ideal) - pixels).max() < 1e-6
+
+
+@LENSES
+def test_the_magnification_is_the_spread_of_undistorted_noise(camera):
+    rng = np.random.default_rng(1)
+    for pixel in pixels_all_over(camera)[:12]:
+        noisy = camera.undistort(pixel + rng.normal(0.0, 0.02, (4000, 2)))
+        spread = float(np.linalg.det(np.cov(noisy.T)) ** 0.25) / 0.02  # of the two axes, the geometric mean
+        assert camera.magnification(camera.undistort(pixel[None]))[0] == pytest.approx(spread, rel=0.04)
+
+
+def test_without_distortion_nothing_is_magnified():
+    assert camera_magnification_is_one(IDEAL)
+    assert camera_magnification_is_one(Camera(640, 480, 500.0, 250.0, 319.5, 239.5))
+
+
+def camera_magnification_is_one(camera: Camera) -> bool:
+    return bool((camera.magnification(pixels_all_over(camera)) == 1.0).all())
+
+
+@LENSES
+def test_derivatives_of_the_lens_agree_with_differences(camera):
+    model, coefficients = camera.distortion_model, camera.distortion
+    points = np.random.default_rng(2).uniform(-0.5, 0.5, (40, 2))
+    step = 1e-6
+    by_point = [
+        (distort(model, coefficients, points + step * e) - distort(model, coefficients, points - step * e))
+        for e in np.eye(2)
+    ]
+    assert np.abs(jacobian(model, coefficients, points) - np.stack(by_point, axis=2) / (2 * step)).max() < 1e-8
+
+    def bent(change: np.ndarray) -> np.ndarray:
+        return distort(model, tuple((np.array(coefficients) + change).tolist()), points)
+
+    by_coefficient = [bent(step * e) - bent(-step * e) for e in np.eye(len(coefficients))]
+    expected = np.stack(by_coefficient, axis=2) / (2 * step)
+    assert np.abs(coefficient_jacobian(model, coefficients, points) - expected).max() < 1e-8
+
+
+def test_what_a_fisheye_lens_sees_far_off_its_axis_is_out_of_reach():
+    camera = Camera(960, 600, 323.5, 323.5, 479.5, 299.5, (), "equidistant")  # 170 degrees across
+    pixels = np.array([[479.5 + 323.5 * np.radians(angle), 299.5] for angle in (0.0, 74.0, 76.0, 84.0)])
+    assert camera.is_within_reach(camera.undistort(pixels)).tolist() == [True, True, False, False]
+    left, top, right, bottom = camera.ideal_bounds_px
+    ideal = camera.undistort(pixels[:2])
+    assert np.all((left < ideal[:, 0]) & (ideal[:, 0] < right) & (top < ideal[:, 1]) & (ideal[:, 1] < bottom))
+    assert right < 479.5 + 323.5 * np.tan(np.radians(77.0))
