@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.drive import Drive, Frame
-from fleetmap.errors import InputError
 from fleetmap.geometry import Pose, Sim3
 from fleetmap.manifest import Quality
 from fleetmap.road_quality import RoadQuality
@@ -22,14 +21,14 @@ from fleetmap_mapper.drift_path import Timed
 from fleetmap_mapper.drive_slam import run_slam
 from fleetmap_mapper.fix_screening import screen_fixes, with_screening
 from fleetmap_mapper.georeferenced_map import adjust_with_fixes, place, pose_frames, without_outliers
-from fleetmap_mapper.georeferencing import GnssTrack, georeference, gnss_track, path_at_fixes
+from fleetmap_mapper.georeferencing import GnssTrack, gnss_track, path_at_fixes
 from fleetmap_mapper.image_mask import ImageMask
 from fleetmap_mapper.map_building import build_visual_map
 from fleetmap_mapper.quality import assess
 from fleetmap_mapper.road_quality import measure_road
-from fleetmap_mapper.segments import join_segments
+from fleetmap_mapper.segment_joining import place_segments
 from fleetmap_mapper.settings import MapperSettings
-from fleetmap_mapper.slam import PosedFrame, Segment
+from fleetmap_mapper.slam import PosedFrame
 from fleetmap_mapper.stage_times import StageTimes
 
 _log = logging.getLogger(__name__)
@@ -69,8 +68,8 @@ def map_drive(
     paths = [Timed.of(_stamps(s.posed), [p.vis_from_cam for p in s.posed]) for s in segments]
     screened = screen_fixes(paths, track, settings.gnss, settings.seed)
     track = screened.track
-    joined, map_from_vis = _placed_segments(segments, track, settings)
-    growing, posed = joined.growing, joined.posed
+    joined = place_segments(segments, track, settings)
+    growing, posed = joined.segment.growing, joined.segment.posed
     placed = place(growing, Sim3.identity())
     if settings.gnss.mode in ("none", "mapping"):
         placed = without_outliers(placed)
@@ -78,7 +77,7 @@ def map_drive(
         placed = adjust_with_fixes(
             placed, growing, posed, track, settings.gnss.level_sigma_deg, settings.calibration, progress
         )
-    placed = replace(placed, map_from_vis=placed.map_from_vis @ map_from_vis)
+    placed = replace(placed, map_from_vis=placed.map_from_vis @ joined.map_from_vis)
 
     frames = pose_frames(placed, growing, posed)
     trajectory = _trajectory(posed, frames, track)
@@ -86,29 +85,9 @@ def map_drive(
     road = measure_road(placed, trajectory, path, track, settings.quality.weak_gap_s)
     quality = assess(placed, road, len(trajectory), drive.frame_count, track.anchor, settings)
     quality = with_screening(quality, screened)
+    remarks = (*quality.remarks, *joined.remarks)
+    quality = quality.model_copy(update={"segments": joined.count, "remarks": remarks})
     return MappedDrive(build_visual_map(placed, growing, track.anchor), trajectory, quality, road)
-
-
-def _placed_segments(
-    segments: Sequence[Segment], track: GnssTrack, settings: MapperSettings
-) -> tuple[Segment, Sim3]:
-    """All segments that their fixes determine, joined in the map frame; and S of the first of them.
-
-    Raises:
-        DriveError: not one segment can be placed.
-    """
-    placeable, refusals = [], []
-    for segment in segments:
-        path = path_at_fixes(_stamps(segment.posed), [p.vis_from_cam for p in segment.posed], track)
-        try:
-            placeable.append((segment, georeference(path, track, settings.gnss.level_sigma_deg)))
-        except InputError as error:
-            refusals.append((segment, error))
-    if not placeable:
-        raise refusals[0][1]
-    for segment, refusal in refusals:
-        _log.warning("a stretch of %d images is left out of the map: %s", len(segment.posed), refusal)
-    return join_segments([s for s, _ in placeable], [S for _, S in placeable]), placeable[0][1]
 
 
 def _counted(drive: Drive, progress: Progress) -> Iterator[Frame]:

@@ -202,6 +202,7 @@ class Quality(_Model):
     publishable: bool
     warnings: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()  # worth knowing, but no reason not to publish
+    segments: Total = 1  # stretches of the drive between losses of tracking
     calibration: CalibrationRecord | None = None
     position_sigma_m: float | None = None  # horizontal, worst direction; median of the keyframes
     position_sigma_p95_m: float | None = None  # 95 % of the keyframes are better
