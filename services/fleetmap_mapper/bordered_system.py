@@ -148,14 +148,17 @@ def sum_rows(values: Array, index: IntArray, count: int) -> Array:
 
 def _pose_system(U: Array, W: Array, WV: Array, images: LinearisedImages) -> sp.csc_matrix:
     """The reduced camera system (6 K, 6 K), symmetric and sparse: keyframes that share no point have no block."""
-    first, second = _pairs(images.keyframe_index, images.starts)
-    places, slots = np.unique(first * images.keyframes + second, return_inverse=True)
+    places, slots = np.unique(_places(images.keyframe_index, images.starts, images.keyframes), return_inverse=True)
     blocks = np.zeros((len(places), 6, 6))
-    _subtract_products(blocks, slots, W, WV, images.starts)
+    _subtract_products(blocks, slots, W, WV, images.keyframe_index, images.starts)
     rows, columns = places // images.keyframes, places % images.keyframes
-    diagonal = np.arange(images.keyframes)
-    blocks = np.concatenate([blocks, U])
-    rows, columns = np.concatenate([rows, diagonal]), np.concatenate([columns, diagonal])
+    upper = rows < columns
+    own = np.arange(images.keyframes)
+    blocks = np.concatenate([blocks, blocks[upper].transpose(0, 2, 1), U])
+    rows, columns = (
+        np.concatenate([rows, columns[upper], own]),
+        np.concatenate([columns, rows[upper], own]),
+    )
     six = np.arange(6)
     i = np.broadcast_to(6 * rows[:, None, None] + six[:, None], blocks.shape)
     j = np.broadcast_to(6 * columns[:, None, None] + six, blocks.shape)
@@ -172,33 +175,37 @@ def _padded(indptr: NDArray[np.int32], length: int) -> NDArray[np.int32]:
 
 
 @njit(cache=True, nogil=True)
-def _pairs(keyframe_index, starts):  # type: ignore[no-untyped-def]
-    """Keyframes of all ordered pairs of observations of one point."""
+def _places(keyframe_index, starts, keyframes):  # type: ignore[no-untyped-def]
+    """For every pair of observations of one point, itself included: which block of the upper triangle it fills."""
     total = 0
     for j in range(len(starts) - 1):
         seen = starts[j + 1] - starts[j]
-        total += seen * seen
-    first, second = np.empty(total, np.int64), np.empty(total, np.int64)
+        total += seen * (seen + 1) // 2
+    places = np.empty(total, np.int64)
     n = 0
     for j in range(len(starts) - 1):
         for a in range(starts[j], starts[j + 1]):
-            for b in range(starts[j], starts[j + 1]):
-                first[n], second[n] = keyframe_index[a], keyframe_index[b]
+            for b in range(a, starts[j + 1]):
+                k, q = keyframe_index[a], keyframe_index[b]
+                places[n] = min(k, q) * keyframes + max(k, q)
                 n += 1
-    return first, second
+    return places
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _subtract_products(blocks, slots, W, WV, starts):  # type: ignore[no-untyped-def]
-    """blocks[slot of (a, b)] -= W_a V^-1 W_b^T, in the order of :func:`_pairs`."""
+def _subtract_products(blocks, slots, W, WV, keyframe_index, starts):  # type: ignore[no-untyped-def]
+    """blocks[slot of (a, b)] -= W_a V^-1 W_b^T, in the order of :func:`_places`."""
     n = 0
     for j in range(len(starts) - 1):
         for a in range(starts[j], starts[j + 1]):
-            for b in range(starts[j], starts[j + 1]):
+            for b in range(a, starts[j + 1]):
                 s = slots[n]
                 n += 1
+                k, q = keyframe_index[a], keyframe_index[b]
                 for c in range(6):
                     for d in range(6):
-                        blocks[s, c, d] -= (
-                            WV[a, c, 0] * W[b, d, 0] + WV[a, c, 1] * W[b, d, 1] + WV[a, c, 2] * W[b, d, 2]
-                        )
+                        value = WV[a, c, 0] * W[b, d, 0] + WV[a, c, 1] * W[b, d, 1] + WV[a, c, 2] * W[b, d, 2]
+                        if k <= q:
+                            blocks[s, c, d] -= value
+                        if k > q or (k == q and a != b):  # the other order of the pair is this one transposed
+                            blocks[s, d, c] -= value
