@@ -26,7 +26,8 @@ from fleetmap_mapper.block_tridiagonal import Levels, diagonal_of_inverse, level
 from fleetmap_mapper.global_adjustment import GlobalProblem, graph_without_images
 
 Array = NDArray[np.float64]
-_UNDETERMINED_M = 1e4  # a sigma beyond is no knowledge of a place
+_UNDETERMINED_M = 300.0  # a sigma beyond is no knowledge of a place
+_WEAK_INFORMATION = [1e-2] * 3 + [1e-6] * 3  # 10 rad, 1 km
 
 
 @dataclass(frozen=True)
@@ -52,15 +53,26 @@ def pose_covariances(problem: GlobalProblem) -> Array:
     has_fix[levels.level_of[[fix.keyframe for fix in problem.fixes]]] = True
     for component in levels.components():
         if has_fix[component.start : component.stop].any():
-            with suppress(np.linalg.LinAlgError):
-                blocks = diagonal_of_inverse([diagonal[i] for i in component], [lower[i] for i in component[:-1]])
-                inverse[component.start : component.stop] = blocks
+            inverse[component.start : component.stop] = _inverse_blocks(
+                [diagonal[i] for i in component], [lower[i] for i in component[:-1]]
+            )
     covariances = np.array(
         [inverse[level][rows, rows] for level, rows in (_place(k, levels) for k in range(len(problem.poses)))]
     )
     sigmas_m = np.sqrt(covariances[:, [3, 4, 5], [3, 4, 5]])
     covariances[~(sigmas_m.max(axis=1) < _UNDETERMINED_M)] = np.nan
     return covariances
+
+
+def _inverse_blocks(diagonal: list[Array], lower: list[Array]) -> list[Array]:
+    """Of a component; where a keyframe hangs on too few landmarks, a prior too weak to matter elsewhere helps."""
+    try:
+        return diagonal_of_inverse(diagonal, lower)
+    except np.linalg.LinAlgError:
+        weak = [block + np.diag(np.tile(_WEAK_INFORMATION, len(block) // 6)) for block in diagonal]
+    with suppress(np.linalg.LinAlgError):
+        return diagonal_of_inverse(weak, lower)
+    return [np.full_like(block, np.nan) for block in diagonal]
 
 
 def position_covariances_m2(problem: GlobalProblem) -> Array:

@@ -110,6 +110,25 @@ def test_a_keyframe_that_sees_nothing_and_has_no_fix_is_unknown_alone(make_world
     assert is_known.tolist() == [True] * len(problem.poses) + [False]
 
 
+def test_a_keyframe_that_hangs_on_one_landmark_is_unknown_alone(make_world):
+    world = make_world(**STREET)
+    problem = problem_of(world, np.random.default_rng(0))
+    hanging = world.poses[5]
+    pixel = world.camera.project_ideal(hanging.inverse().transform(world.points))[[0]]
+    dangling = replace(
+        problem,
+        poses=[*problem.poses, hanging],
+        keyframe_index=np.append(problem.keyframe_index, len(problem.poses)).astype(np.int32),
+        point_index=np.append(problem.point_index, 0).astype(np.int32),
+        pixels=np.vstack([problem.pixels, pixel]),
+        sigmas_px=np.append(problem.sigmas_px, 1.0),
+        level_sigma_rad=LEVEL_RAD * np.sqrt(len(problem.poses) / (len(problem.poses) + 1)),
+    )
+    found = pose_covariances(dangling)
+    assert np.isnan(found[-1]).all()
+    assert relative_error(found[:-1], pose_covariances(problem)) < 1e-4
+
+
 def test_it_grows_away_from_the_fixes(make_world):
     world = make_world(keyframes=40, points=900, step_m=2.0)
     fixed = [k for k in range(40) if k < 10 or k >= 30]
