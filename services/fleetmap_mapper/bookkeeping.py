@@ -74,6 +74,36 @@ def add_views(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
+def fuse_pairs(lost, kept, merged_into, tallies, oldest, newest):  # type: ignore[no-untyped-def]
+    """Fuse landmarks that are themselves until now: pair after pair, and what a pair was fused with before.
+
+    The successor takes over the tallies and the range of keyframes. Returns those that are gone (n,) int32.
+    """
+    gone = np.empty(len(lost), np.int32)
+    count = 0
+    for n in range(len(lost)):
+        a, b = np.int64(lost[n]), np.int64(kept[n])
+        while merged_into[a] != a:
+            a = merged_into[a]
+        while merged_into[b] != b:
+            b = merged_into[b]
+        if a == b:
+            continue
+        merged_into[a] = b
+        gone[count] = a
+        count += 1
+        for tally in tallies:
+            tally[b] += tally[a]
+        oldest[b], newest[b] = min(oldest[a], oldest[b]), max(newest[a], newest[b])
+    for a in gone[:count]:
+        successor = merged_into[a]
+        while merged_into[successor] != successor:
+            successor = merged_into[successor]
+        merged_into[a] = successor
+    return gone[:count].copy()
+
+
+@njit(cache=True, nogil=True)
 def follow_fusions(landmark_of, marks, successors, observations):  # type: ignore[no-untyped-def]
     """Rename the marked landmarks in one keyframe; where it then holds one twice, the first feature keeps it."""
     is_renamed = False

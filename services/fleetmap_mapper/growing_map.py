@@ -22,6 +22,7 @@ from fleetmap_mapper.bookkeeping import (
     count_marked,
     distinct_living,
     follow_fusions,
+    fuse_pairs,
     marked_features,
 )
 
@@ -57,6 +58,8 @@ class Keyframe:
     vis_from_cam: Pose
     features: Features
     landmark_of: Ids  # (N,) landmark of each feature, -1 for none
+    noise: Array  # (N,) factor on each feature's sigma
+    is_aligned: NDArray[np.bool_]  # (N,) whether its pixel comes from aligning patches, or is a corner's
 
     def landmarks(self) -> Ids:
         """Ids of the landmarks seen here."""
@@ -69,6 +72,7 @@ class GrowingMap:
     def __init__(self, camera: Camera) -> None:
         self.camera = camera
         self.keyframes: list[Keyframe] = []
+        self.track_correlation = 0.0  # of errors from one observation of a landmark to the next
         self.landmark_count = 0
         self.points: Array = np.zeros((1024, 3))
         self.normals: Array = np.zeros((1024, 3))  # mean unit vector from landmark to observers
@@ -91,7 +95,16 @@ class GrowingMap:
     ) -> Keyframe:
         """Append a keyframe that sees some landmarks already."""
         nothing = np.full(len(features), -1, np.int32)
-        keyframe = Keyframe(len(self.keyframes), frame_index, stamp_ns, vis_from_cam, features, nothing)
+        keyframe = Keyframe(
+            len(self.keyframes),
+            frame_index,
+            stamp_ns,
+            vis_from_cam,
+            features,
+            nothing,
+            np.ones(len(features)),
+            np.zeros(len(features), np.bool_),
+        )
         self.keyframes.append(keyframe)
         rows = np.flatnonzero(landmark_of >= 0)
         self.observe(keyframe, rows, landmark_of[rows].astype(np.int32))
@@ -175,18 +188,9 @@ class GrowingMap:
 
     def merge(self, lost: Ids, kept: Ids) -> None:
         """Fuse pairs of landmarks: every observation of ``lost[n]`` becomes one of ``kept[n]``."""
-        target: dict[int, int] = {}
-        for a, b in zip(lost.tolist(), kept.tolist(), strict=True):
-            a, b = _end(target, a), _end(target, b)
-            if a != b:
-                target[a] = b
-                for tally in (self.found, self.visible, self.observations):
-                    tally[b] += tally[a]
-                self.oldest[b] = min(self.oldest[a], self.oldest[b])
-                self.newest[b] = max(self.newest[a], self.newest[b])
-        gone = np.array(sorted(target), np.int32)
-        successors = np.array([_end(target, a) for a in gone.tolist()], np.int32)
-        self.merged_into[gone] = successors
+        tallies = self.found, self.visible, self.observations
+        gone = np.sort(fuse_pairs(lost, kept, self.merged_into, tallies, self.oldest, self.newest))
+        successors = self.merged_into[gone].astype(np.int32)
         self.alive[gone] = False
         self.observations[gone] = 0
         self.touch(successors)
@@ -253,9 +257,3 @@ class GrowingMap:
         if len(ids) == 0:
             return []
         return self.keyframes[self.oldest[ids].min() : self.newest[ids].max() + 1]
-
-
-def _end(target: dict[int, int], index: int) -> int:
-    while index in target:
-        index = target[index]
-    return index
