@@ -117,15 +117,17 @@ def _draw_landmarks(axes: Any, points_m: Array, positions_m: Array) -> None:
 
 
 def _draw_road(axes: Any, report: MapReport, positions_m: Array) -> None:
-    """Coloured by the position's sigma; grey where it is unknown."""
+    """Coloured by the position's sigma; grey where it is unknown, dotted where no image was posed."""
     pieces = np.stack([positions_m[:-1, :2], positions_m[1:, :2]], axis=1)
-    axes.plot(*positions_m[:, :2].T, color="0.35", linewidth=3.5, zorder=3)
+    is_driven = ~_is_gap(report)
+    axes.plot(*positions_m[:, :2].T, color="0.35", linestyle=":", linewidth=1.5, zorder=3)
+    axes.add_collection(LineCollection(list(pieces[is_driven]), color="0.35", linewidth=3.5, zorder=3))
     road = report.road
     if road is None or not np.isfinite(road.keyframes.horizontal_sigmas_m).any():
         return
     sigmas_m = road.keyframes.horizontal_sigmas_m
     between_m = np.maximum(sigmas_m[:-1], sigmas_m[1:])
-    known = np.isfinite(between_m)
+    known = np.isfinite(between_m) & is_driven
     worst_m = max(report.limits.get("weak_position_sigma_m", _WEAK_SIGMA_M), 10.0 * _LEAST_SIGMA_M)
     coloured = LineCollection(
         list(pieces[known]), cmap=_SIGMA_COLOURS, norm=LogNorm(_LEAST_SIGMA_M, worst_m), linewidth=3.5, zorder=4
@@ -137,6 +139,15 @@ def _draw_road(axes: Any, report: MapReport, positions_m: Array) -> None:
         coloured, ax=axes, location="left", shrink=0.7, aspect=40, pad=0.01, format=FuncFormatter(_metres)
     )
     bar.set_label("position uncertainty (m, horizontal, 1 sigma); the upper end is the limit")
+
+
+def _is_gap(report: MapReport) -> NDArray[np.bool_]:
+    """Which ways (K - 1,) from keyframe to keyframe hold a time without posed images."""
+    along_m = _along_m(report)
+    found = np.zeros(len(along_m) - 1, np.bool_)
+    for from_m, to_m in () if report.road is None else report.road.gaps_m:
+        found |= (along_m[:-1] <= from_m) & (along_m[1:] >= to_m)
+    return found
 
 
 def _draw_weak_stretch(axes: Any, number: int, places_m: Array) -> None:
@@ -224,8 +235,8 @@ def _draw_position(axes: Any, report: MapReport) -> None:
     if not np.isfinite(keyframes.horizontal_sigmas_m).any():
         axes.text(0.5, 0.5, "unknown", transform=axes.transAxes, ha="center", color="0.4")
         return
-    axes.plot(keyframes.along_m, keyframes.horizontal_sigmas_m, color=_LINE, label="horizontal")
-    axes.plot(keyframes.along_m, keyframes.vertical_sigmas_m, color=_SECOND, label="height")
+    _draw_figure(axes, report, keyframes.horizontal_sigmas_m, _LINE, "horizontal")
+    _draw_figure(axes, report, keyframes.vertical_sigmas_m, _SECOND, "height")
     _draw_limit(axes, report, "weak_position_sigma_m", keyframes.horizontal_sigmas_m)
     axes.legend(fontsize="small", loc="upper right", ncols=3)
 
@@ -252,14 +263,23 @@ def _draw_density(axes: Any, report: MapReport) -> None:
 
 def _draw_seen(axes: Any, report: MapReport) -> None:
     keyframes = _road(report).keyframes
-    axes.plot(keyframes.along_m, keyframes.landmarks, color=_LINE)
+    _draw_figure(axes, report, keyframes.landmarks, _LINE)
     _draw_limit(axes, report, "weak_landmarks_per_image", keyframes.landmarks)
 
 
 def _draw_reprojection(axes: Any, report: MapReport) -> None:
     keyframes = _road(report).keyframes
-    axes.plot(keyframes.along_m, keyframes.reprojection_rms_px, color=_LINE)
+    _draw_figure(axes, report, keyframes.reprojection_rms_px, _LINE)
     _draw_limit(axes, report, "weak_reprojection_rms_px", keyframes.reprojection_rms_px)
+
+
+def _draw_figure(
+    axes: Any, report: MapReport, values: NDArray[Any], colour: str, label: str | None = None
+) -> None:
+    """A line through the values at the keyframes, broken where no image was posed."""
+    along_m, gaps = _along_m(report), np.flatnonzero(_is_gap(report)) + 1
+    broken = np.insert(values.astype(np.float64), gaps, np.nan)
+    axes.plot(np.insert(along_m, gaps, along_m[gaps]), broken, color=colour, label=label)
 
 
 def _draw_limit(axes: Any, report: MapReport, name: str, values: NDArray[Any]) -> None:
