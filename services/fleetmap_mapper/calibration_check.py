@@ -84,49 +84,62 @@ def estimate_calibration(
         return None
 
 
-def calibration_record(
-    estimate: CalibrationEstimate | None, map_camera: Camera, settings: CalibrationGroup
-) -> CalibrationRecord | None:
+def _matters(part: Disagreement, settings: CalibrationGroup) -> bool:
+    return part.sigmas > settings.warn_sigmas and part.border_px > settings.warn_border_px
+
+
+def calibration_record(estimate: CalibrationEstimate | None, map_camera: Camera) -> CalibrationRecord | None:
     """The estimate as the manifest of a map made with ``map_camera`` keeps it."""
     if estimate is None:
         return None
     return CalibrationRecord(
         recorded=CameraRecord(**asdict(estimate.recorded)),
-        fitted=CameraRecord(**asdict(map_camera if settings.refine else estimate.fitted)),
+        fitted=CameraRecord(**asdict(map_camera if map_camera != estimate.recorded else estimate.fitted)),
         focal_sigma_px=estimate.focal_sigma_px,
         centre_sigma_px=estimate.centre_sigma_px,
         distortion_sigma=estimate.distortion_sigma,
-        refined=settings.refine,
+        refined=map_camera != estimate.recorded,
     )
 
 
-def calibration_remarks(estimate: CalibrationEstimate | None, settings: CalibrationGroup) -> list[str]:
-    """One line for each part of the recorded calibration that the drive contradicts; none once it is refined."""
-    if estimate is None or settings.refine:
+def is_contradicted(estimate: CalibrationEstimate | None, settings: CalibrationGroup) -> bool:
+    """Whether the drive knows the calibration better than the recording, in a way that shapes the map."""
+    if estimate is None:
+        return False
+    return any(
+        part.sigmas > settings.adopt_sigmas and part.border_px > settings.adopt_border_px
+        for part in (estimate.focal, estimate.centre, estimate.lens)
+    )
+
+
+def calibration_remarks(
+    estimate: CalibrationEstimate | None, map_camera: Camera, settings: CalibrationGroup
+) -> list[str]:
+    """One line for each part of the recorded calibration that the drive contradicts, unless asked to refine."""
+    if estimate is None or settings.mode == "refined":
         return []
     recorded, fitted, found = estimate.recorded, estimate.fitted, []
-
-    def matters(part: Disagreement) -> bool:
-        return part.sigmas > settings.warn_sigmas and part.border_px > settings.warn_border_px
-
-    if matters(estimate.focal):
+    if _matters(estimate.focal, settings):
         found.append(
             f"the recorded focal length {_focal_px(recorded):.1f} px disagrees with the drive: "
             f"{_focal_px(fitted):.1f} +- {estimate.focal_sigma_px:.1f} px fits"
         )
-    if matters(estimate.centre):
+    if _matters(estimate.centre, settings):
         found.append(
             f"the recorded image centre ({recorded.cx_px:.1f}, {recorded.cy_px:.1f}) px disagrees with the drive: "
             f"({fitted.cx_px:.1f}, {fitted.cy_px:.1f}) +- "
             f"({estimate.centre_sigma_px[0]:.1f}, {estimate.centre_sigma_px[1]:.1f}) px fits"
         )
-    if matters(estimate.lens):
+    if _matters(estimate.lens, settings):
         coefficients = " ".join(f"{k:.4f}" for k in fitted.distortion)
         found.append(
             f"the recorded lens distortion disagrees with the drive by {estimate.lens.border_px:.1f} px at the "
             f"image border: {fitted.distortion_model} {coefficients} fits"
         )
-    return [f"{line}; recalibrate, or map with --refine-calibration" for line in found]
+    advice = "recalibrate, or map with --refine-calibration"
+    if map_camera != recorded:
+        advice = "the map is made with the drive's own calibration; recalibrate"
+    return [f"{line}; {advice}" for line in found]
 
 
 def _judged(prior: CalibrationPrior, change: Array, covariance: Array) -> CalibrationEstimate:

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from fleetmap.geodesy import UtmAnchor
 from fleetmap.vision.matching import medoid_descriptor
 from fleetmap.visual_map import Keyframes, Landmarks, Observations, VisualMap
-from fleetmap_mapper.georeferenced_map import PlacedMap
 from fleetmap_mapper.growing_map import GrowingMap
+from fleetmap_mapper.placed_map import PlacedMap
 
 Array = NDArray[np.float64]
 

@@ -20,16 +20,19 @@ from fleetmap_mapper.alignment import GnssAligner
 from fleetmap_mapper.drift_path import Timed
 from fleetmap_mapper.drive_slam import run_slam
 from fleetmap_mapper.fix_screening import screen_fixes, with_screening
-from fleetmap_mapper.georeferenced_map import adjust_with_fixes, place, pose_frames, without_outliers
+from fleetmap_mapper.georeferenced_map import adjust_with_fixes, pose_frames
 from fleetmap_mapper.georeferencing import GnssTrack, gnss_track, path_at_fixes
 from fleetmap_mapper.image_mask import ImageMask
 from fleetmap_mapper.map_building import build_visual_map
+from fleetmap_mapper.placed_map import place, without_outliers
 from fleetmap_mapper.quality import assess
 from fleetmap_mapper.road_quality import measure_road
 from fleetmap_mapper.segment_joining import place_segments
 from fleetmap_mapper.settings import MapperSettings
 from fleetmap_mapper.slam import PosedFrame
 from fleetmap_mapper.stage_times import StageTimes
+from fleetmap_mapper.straightening import straighten
+from fleetmap_mapper.tightening import tighten
 
 _log = logging.getLogger(__name__)
 
@@ -64,18 +67,33 @@ def map_drive(
     segments = run_slam(_counted(drive, progress), drive.camera, settings, aligner, times, mask)
     _report_speed(sum(len(s.posed) for s in segments), time.perf_counter() - start_s, times)
 
+    calibration = None
+    if settings.gnss.mode != "mapping":
+        tightened = tighten(segments, drive.frames, settings.calibration, progress)
+        segments, calibration = tightened.segments, tightened.calibration
     progress("placing the map", 0, 1)
     paths = [Timed.of(_stamps(s.posed), [p.vis_from_cam for p in s.posed]) for s in segments]
     screened = screen_fixes(paths, track, settings.gnss, settings.seed)
     track = screened.track
+    if settings.gnss.mode in ("final", "full"):
+        for segment, consensus in zip(segments, screened.consensus, strict=True):
+            if consensus is not None:
+                straighten(segment, consensus)
     joined = place_segments(segments, track, settings)
     growing, posed = joined.segment.growing, joined.segment.posed
     placed = place(growing, Sim3.identity())
     if settings.gnss.mode in ("none", "mapping"):
-        placed = without_outliers(placed)
+        placed = replace(without_outliers(placed), calibration=calibration)
     else:
         placed = adjust_with_fixes(
-            placed, growing, posed, track, settings.gnss.level_sigma_deg, settings.calibration, progress
+            placed,
+            growing,
+            posed,
+            track,
+            settings.gnss.level_sigma_deg,
+            drive.camera,
+            settings.calibration,
+            progress,
         )
     placed = replace(placed, map_from_vis=placed.map_from_vis @ joined.map_from_vis)
 

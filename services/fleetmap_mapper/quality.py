@@ -12,7 +12,7 @@ from fleetmap.geodesy import UtmAnchor
 from fleetmap.manifest import Quality
 from fleetmap.road_quality import RoadQuality
 from fleetmap_mapper.calibration_check import calibration_record, calibration_remarks
-from fleetmap_mapper.georeferenced_map import PlacedMap, reprojection_errors_px
+from fleetmap_mapper.placed_map import PlacedMap, reprojection_errors_px
 from fleetmap_mapper.settings import MapperSettings, QualityGroup
 from fleetmap_mapper.weak_stretches import find_weak_stretches, visual_ties
 
@@ -50,8 +50,8 @@ def assess(
         landmarks_per_m=round(len(placed.points_m) / road.length_m, 3),
         weak_length_m=round(sum(stretch.to_m - stretch.from_m for stretch in weak), 3),
         weak_stretches=weak,
-        calibration=calibration_record(placed.calibration, placed.camera, settings.calibration),
-        remarks=tuple(calibration_remarks(placed.calibration, settings.calibration)),
+        calibration=calibration_record(placed.calibration, placed.camera),
+        remarks=tuple(calibration_remarks(placed.calibration, placed.camera, settings.calibration)),
     )
     warnings = tuple(_warnings(quality, road, settings)) or tuple(_weakness(quality, settings.quality))
     return quality.model_copy(update={"warnings": warnings, "publishable": not warnings})

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from fleetmap.road_quality import FixQuality, KeyframeQuality, RoadQuality, horizontal_sigmas_m
 from fleetmap.trajectory import Trajectory
-from fleetmap_mapper.georeferenced_map import PlacedMap, reprojection_errors_px
 from fleetmap_mapper.georeferencing import GnssTrack, PathPoint
+from fleetmap_mapper.placed_map import PlacedMap, reprojection_errors_px
 
 Array = NDArray[np.float64]
 _GAP_INTERVALS = 2.5  # of the usual time between posed images; one image missed is none yet

@@ -18,6 +18,7 @@ def join_segments(segments: Sequence[Segment], map_from_vis: Sequence[Sim3]) -> 
     A frame that two segments could pose stays with the one that saw more landmarks in it.
     """
     joined = GrowingMap(segments[0].growing.camera)
+    joined.track_correlation = max(s.growing.track_correlation for s in segments)
     posed: dict[int, PosedFrame] = {}
     for segment, S in zip(segments, map_from_vis, strict=True):
         keyframe_offset, landmark_offset = len(joined.keyframes), joined.landmark_count

@@ -6,6 +6,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+CalibrationMode = Literal["recorded", "auto", "refined"]
 GnssMode = Literal["none", "mapping", "final", "full"]
 
 
@@ -73,7 +74,11 @@ class CalibrationGroup(_Group):
     The sigmas of a calibration made in a workshop, on another day: they hold what a drive does not determine.
     """
 
-    refine: bool = False  # estimate it together with poses and landmarks
+    # recorded: taken as it is. refined: estimated together with poses and landmarks. auto: refined where the drive
+    # contradicts the recorded one clearly, see adopt_*.
+    mode: CalibrationMode = "auto"
+    adopt_sigmas: float = 4.0  # a disagreement is acted upon that is as clear as this ...
+    adopt_border_px: float = 0.5  # ... and shifts pixels at the image border by as much
     focal_sigma_ratio: float = Field(default=0.03, gt=0.0)  # of the focal length
     aspect_sigma_ratio: float = Field(default=0.002, gt=0.0)  # of fx against fy: how square pixels are
     centre_sigma_ratio: float = Field(default=0.015, gt=0.0)  # of the image width

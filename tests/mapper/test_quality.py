@@ -13,7 +13,7 @@ from fleetmap.geodesy import UtmAnchor
 from fleetmap.geometry import Sim3
 from fleetmap.manifest import Quality
 from fleetmap.trajectory import Trajectory
-from fleetmap_mapper.georeferenced_map import PlacedMap
+from fleetmap_mapper.placed_map import PlacedMap
 from fleetmap_mapper.georeferencing import GnssTrack, PathPoint
 from fleetmap_mapper.quality import assess
 from fleetmap_mapper.road_quality import measure_road
@@ -54,7 +54,8 @@ def judge(make_world: Any) -> Callable[..., Quality]:
             np.zeros(len(pixels), np.int32),
             pixels,
             world.sigmas_px,
-            np.tile(np.eye(3) * sigma_m**2, (KEYFRAMES, 1, 1)),
+            np.zeros(len(pixels), np.bool_),
+            position_covariances_m2=np.tile(np.eye(3) * sigma_m**2, (KEYFRAMES, 1, 1)),
         )
         stamps = np.arange(KEYFRAMES) * 10**9
         stamps[KEYFRAMES // 2 :] += int(gap_s * 1e9)

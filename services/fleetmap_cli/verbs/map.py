@@ -14,11 +14,12 @@ from fleetmap_cli.mapping import DriveChoice, map_and_publish, map_recording
 from fleetmap_cli.options import XYZ
 from fleetmap_cli.watching import stop_on_signals, watch_folder
 from fleetmap_mapper.setting_assignments import with_assignments
-from fleetmap_mapper.settings import CalibrationGroup, GnssGroup, GnssMode, MapperSettings
+from fleetmap_mapper.settings import CalibrationGroup, CalibrationMode, GnssGroup, GnssMode, MapperSettings
 
 _PATH = click.Path(path_type=Path)
 _FILE = click.Path(path_type=Path, dir_okay=False)
 _UNFIT = 3
+_CALIBRATION: dict[bool | None, CalibrationMode] = {None: "auto", True: "refined", False: "recorded"}
 
 
 @click.command("map")
@@ -48,10 +49,11 @@ _UNFIT = 3
     help="Use only what is white in this picture of the images' size; black hides the own bonnet, for example.",
 )
 @click.option(
-    "--refine-calibration",
-    is_flag=True,
-    help="Estimate focal length, centre and lens distortion together with the map; what the drive does not "
-    "determine (nearly all of it on a straight road) stays as recorded.",
+    "--refine-calibration/--recorded-calibration",
+    default=None,
+    help="Estimate focal length, centre and lens distortion together with the map (what the drive does not "
+    "determine, nearly all of it on a straight road, stays as recorded), or never.  [default: where the drive "
+    "contradicts the recorded calibration clearly; it is told]",
 )
 @click.option(
     "--set",
@@ -81,7 +83,7 @@ def map_(
     gnss_topic: str | None,
     antenna_offset: tuple[float, float, float] | None,
     mask: Path | None,
-    refine_calibration: bool,
+    refine_calibration: bool | None,
     assignments: tuple[str, ...],
     seed: int,
     force: bool,
@@ -103,11 +105,11 @@ def map_(
     if verbose:
         logging.getLogger("fleetmap_mapper").setLevel(logging.INFO)
     settings = MapperSettings(
-        seed=seed, gnss=GnssGroup(mode=gnss), calibration=CalibrationGroup(refine=refine_calibration)
+        seed=seed, gnss=GnssGroup(mode=gnss), calibration=CalibrationGroup(mode=_CALIBRATION[refine_calibration])
     )
     settings = with_assignments(settings, assignments)
-    if settings.calibration.refine and settings.gnss.mode not in ("final", "full"):
-        raise click.UsageError("--refine-calibration needs the joint adjustment: --gnss final or --gnss full")
+    if settings.calibration.mode == "refined" and settings.gnss.mode == "mapping":
+        raise click.UsageError("--refine-calibration needs an adjustment at the end: --gnss none, final or full")
     choice = DriveChoice(image_topic, gnss_topic, antenna_offset, mask)
     if watch is not None:
         if recording or output or trajectory or map_id or force:
