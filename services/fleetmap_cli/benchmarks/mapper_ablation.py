@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from fleetmap.evaluation import judge
 from fleetmap.trajectory import read_trajectory
 from fleetmap_cli.benchmarks.mapper_drives import KITTI_RAW, ODOMETRY_RTK_5S, Circuit, Recording
 from fleetmap_cli.benchmarks.mapper_runs import (
     MapRun,
+    beside_splines,
     judged,
     mapped,
     position_figures,
@@ -64,25 +66,28 @@ def ablation_rows(circuit: Circuit) -> tuple[Row, ...]:
 
 def _row(case: _Case, cases: tuple[_Case, ...]) -> Row:
     def measure(bench: Workbench) -> Figures:
-        judgements = {mode: judged(bench, mapped(bench, case.recording, mode))["reference"] for mode in _MODES}
+        runs = {mode: mapped(bench, case.recording, mode) for mode in _MODES}
+        together = beside_splines(bench, runs["full"])
+        judgements = {mode: judged(bench, run)["reference"] for mode, run in runs.items() if mode != "full"}
+        judgements["full"] = together["reference"]
         without = judgements["none"]["position_m"]
         for mode, judgement in judgements.items():
-            position_m = judgement["position_m"]
-            bench.beside(
-                _MODES[mode][0],
-                position_figures(judgement)
-                | {
-                    "RMSE m": rounded(position_m["rmse"]),
-                    "mean, times below none": rounded(without["mean"] / position_m["mean"], 1),
-                    "RMSE, times below none": rounded(without["rmse"] / position_m["rmse"], 1),
-                }
-                | rotation_figures(judgement),
-            )
+            bench.beside(_MODES[mode][0], _figures(judgement, without) | rotation_figures(judgement))
+        bench.beside("smoothing spline through the fixes alone", _figures(together["smoothing_spline"], without))
         bench.shown(f"fleetmap benchmark mapper --rows {','.join(each.name for each in cases)}")
         _draw(bench, cases)
         return {}
 
     return Row(case.name, case.about, measure, case.recording.needs, ABLATION, "full <= final <= none")
+
+
+def _figures(judgement: dict[str, Any], without: dict[str, float]) -> Figures:
+    position_m = judgement["position_m"]
+    return position_figures(judgement) | {
+        "RMSE m": rounded(position_m["rmse"]),
+        "mean, times below none": rounded(without["mean"] / position_m["mean"], 1),
+        "RMSE, times below none": rounded(without["rmse"] / position_m["rmse"], 1),
+    }
 
 
 def _draw(bench: Workbench, cases: tuple[_Case, ...]) -> None:

@@ -33,21 +33,21 @@ def results(tmp_path_factory):
     circuit = Circuit(length_m=45.0, tunnel_s=2.0, world=world)
     rows = ["circuit-slam", "circuit-tunnel", "ablation-circuit"]
     outcomes = run_benchmark(mapper_benchmark(circuit), folder, folder / "out", row_names=rows)
+    assert [outcome.reason for outcome in outcomes] == [""] * 3
     return folder / "out", {outcome.name: outcome for outcome in outcomes}
 
 
 def test_plain_slam_is_judged_by_its_shape(results):
     _, outcomes = results
     plain = outcomes["circuit-slam"]
-    assert plain.status == "measured", plain.reason
     assert 0.002 < plain.figures["mean m"] < 0.5
     assert plain.figures["posed"] == "26 of 26"
+    assert plain.figures["50 m windows: RMSE m"] is None  # the drive is shorter
 
 
 def test_a_tunnel_is_held_against_the_run_without_one(results):
     _, outcomes = results
     tunnel = outcomes["circuit-tunnel"]
-    assert tunnel.status == "measured", tunnel.reason
     figures = tunnel.figures
     assert 16.0 < figures["without fixes m"] < 28.0  # two seconds, and up to the fixes beside
     assert 0.01 < figures["inside: mean m"] <= figures["max m"] < 0.5
@@ -61,9 +61,10 @@ def test_a_tunnel_is_held_against_the_run_without_one(results):
 def test_each_use_of_the_fixes_has_a_line_and_together_they_have_a_picture(results):
     folder, outcomes = results
     ablation = outcomes["ablation-circuit"]
-    assert ablation.status == "measured", ablation.reason
-    means = [line["mean m"] for line in ablation.lines.values()]
-    assert [label.split("`")[1] for label in ablation.lines] == ["none", "mapping", "final", "full"]
+    *modes, spline = ablation.lines
+    means = [ablation.lines[mode]["mean m"] for mode in modes]
+    assert [mode.split("`")[1] for mode in modes] == ["none", "mapping", "final", "full"]
+    assert 0.01 < ablation.lines[spline]["mean m"] < 0.5
     assert means[0] != means[1]
     assert 0.01 < means[3] < means[0] < 1.0
     assert ablation.lines["`full`: both"]["mean, times below none"] == pytest.approx(means[0] / means[3], rel=0.05)
@@ -91,7 +92,7 @@ def test_the_report_has_a_table_a_group(results):
     assert headings == ["## Plain SLAM", "## Without fixes", "## Ablation", "## Commands"]
     assert "| full <= final <= none |" in text
     assert [row["group"] for row in rows] == ["Plain SLAM", "Without fixes", "Ablation"]
-    assert len(rows[2]["lines"]) == 4
+    assert len(rows[2]["lines"]) == 5
     assert rows[1]["reach"].startswith("inside <= 0.5 %")
 
 
