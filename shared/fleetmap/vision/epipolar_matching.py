@@ -11,7 +11,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from fleetmap.vision.features import Features
-from fleetmap.vision.matching import as_words, hamming, index_pairs
+from fleetmap.vision.matching import as_words, hamming_to_all, index_pairs
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int32]
@@ -78,6 +78,11 @@ def _epipole(fundamental_ba: Array) -> Array:
 def _match_along_lines(pixels_a, words_a, chosen_a, pixels_b, words_b, reach_b, F, epipole, max_distance):  # type: ignore[no-untyped-def]
     middle, axes, is_far = _pencil(epipole, pixels_b)
     starts, members = _features_in_sectors(pixels_b, reach_b, epipole, axes)
+    columns = np.empty((4, len(members)), np.uint64)
+    for slot, j in enumerate(members):
+        for word in range(4):
+            columns[word, slot] = words_b[j, word]
+    distances = np.empty(len(pixels_b), np.int64)
     best_of_b = np.full(len(pixels_b), max_distance + 1, np.int64)
     a_of_b = np.full(len(pixels_b), -1, np.int32)
     b_of_a = np.full(len(pixels_a), -1, np.int32)
@@ -95,12 +100,13 @@ def _match_along_lines(pixels_a, words_a, chosen_a, pixels_b, words_b, reach_b, 
             offset = x * middle[0] + y * middle[1] + w
             dx, dy = middle[0] - offset * x - epipole[0], middle[1] - offset * y - epipole[1]
         sector = int(_sector(axes, dx, dy)) % _SECTORS
+        first, end = starts[sector], starts[sector + 1]
+        hamming_to_all(words_a[i], columns[:, first:end], distances[: end - first])
         best = max_distance + 1
-        for slot in range(starts[sector], starts[sector + 1]):
-            j = members[slot]
-            if abs(x * pixels_b[j, 0] + y * pixels_b[j, 1] + w) > reach_b[j]:
+        for slot in range(first, end):
+            distance, j = distances[slot - first], members[slot]
+            if distance > max_distance or abs(x * pixels_b[j, 0] + y * pixels_b[j, 1] + w) > reach_b[j]:
                 continue
-            distance = hamming(words_a, i, words_b, j)
             if distance < best:
                 best = distance
                 b_of_a[i] = j

@@ -97,15 +97,30 @@ def as_words(descriptors: Descriptors) -> NDArray[np.uint64]:
 
 @njit(cache=True, nogil=True, inline="always")
 def hamming(a, i, b, j):  # type: ignore[no-untyped-def]
-    """Bits that differ; the counting trick is recognised by LLVM and becomes one popcount per word."""
+    """Bits that differ between descriptors a[i] and b[j]."""
     total = np.uint64(0)
     for word in range(4):
-        x = a[i, word] ^ b[j, word]
-        x = x - ((x >> np.uint64(1)) & np.uint64(0x5555555555555555))
-        x = (x & np.uint64(0x3333333333333333)) + ((x >> np.uint64(2)) & np.uint64(0x3333333333333333))
-        x = (x + (x >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
-        total += (x * np.uint64(0x0101010101010101)) >> np.uint64(56)
+        total += bit_count(a[i, word] ^ b[j, word])
     return np.int64(total)
+
+
+@njit(cache=True, nogil=True)
+def hamming_to_all(words, columns, distances):  # type: ignore[no-untyped-def]
+    """Bits that differ between a descriptor (4,) and each of a list (4, N), which lies word by word."""
+    a, b, c, d = words[0], words[1], words[2], words[3]
+    first, second, third, fourth = columns[0], columns[1], columns[2], columns[3]
+    for n in range(len(distances)):
+        near = bit_count(a ^ first[n]) + bit_count(b ^ second[n])
+        distances[n] = near + bit_count(c ^ third[n]) + bit_count(d ^ fourth[n])
+
+
+@njit(cache=True, nogil=True, inline="always")
+def bit_count(x):  # type: ignore[no-untyped-def]
+    """Bits set in a word; LLVM recognises the trick and makes it one instruction, for several words at once."""
+    x = x - ((x >> np.uint64(1)) & np.uint64(0x5555555555555555))
+    x = (x & np.uint64(0x3333333333333333)) + ((x >> np.uint64(2)) & np.uint64(0x3333333333333333))
+    x = (x + (x >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
+    return (x * np.uint64(0x0101010101010101)) >> np.uint64(56)
 
 
 @njit(cache=True, nogil=True)
