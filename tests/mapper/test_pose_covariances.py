@@ -12,12 +12,14 @@ from gtsam.symbol_shorthand import L, X
 
 from fleetmap.geometry import Pose
 from fleetmap_mapper import global_adjustment
-from fleetmap_mapper.global_adjustment import FixTerm, GlobalProblem, adjust_globally
+from fleetmap_mapper.fix_terms import FixTerm
+from fleetmap_mapper.global_adjustment import GlobalProblem, adjust_globally
 from fleetmap_mapper.pose_covariances import pose_covariances, position_covariances_m2
 
 ARM = np.array([0.3, -1.2, -0.8])
 FIX_COVARIANCE = np.diag([1.0, 1.5, 4.0]) * 0.05**2
 LEVEL_RAD = np.radians(0.5)
+NO_LEVEL = 1e6  # rad: as good as no prior, whose weight depends on the whole drive
 STREET = {"keyframes": 24, "points": 400, "step_m": 2.0}  # a keyframe sees back as far as half the street
 
 
@@ -85,7 +87,10 @@ def test_positions_are_turned_into_the_map(make_world):
 
 def test_what_no_fix_is_tied_to_is_unknown_and_the_rest_is_not(make_world):
     """Two streets that share no landmark, fixes on the first of them only."""
-    first, second = (problem_of(make_world(seed=seed, **STREET), np.random.default_rng(seed)) for seed in (1, 2))
+    first, second = (
+        replace(problem_of(make_world(seed=seed, **STREET), np.random.default_rng(seed)), level_sigma_rad=NO_LEVEL)
+        for seed in (1, 2)
+    )
     keyframes, points = len(first.poses), len(first.points_m)
     both = replace(
         first,
@@ -95,7 +100,6 @@ def test_what_no_fix_is_tied_to_is_unknown_and_the_rest_is_not(make_world):
         point_index=np.concatenate([first.point_index, second.point_index + points]),
         pixels=np.vstack([first.pixels, second.pixels]),
         sigmas_px=np.concatenate([first.sigmas_px, second.sigmas_px]),
-        level_sigma_rad=LEVEL_RAD / np.sqrt(2.0),  # spread over twice as many keyframes
     )
     found = pose_covariances(both)
     assert np.isnan(found[keyframes:]).all()
@@ -112,7 +116,7 @@ def test_a_keyframe_that_sees_nothing_and_has_no_fix_is_unknown_alone(make_world
 
 def test_a_keyframe_that_hangs_on_one_landmark_is_unknown_alone(make_world):
     world = make_world(**STREET)
-    problem = problem_of(world, np.random.default_rng(0))
+    problem = replace(problem_of(world, np.random.default_rng(0)), level_sigma_rad=NO_LEVEL)
     hanging = world.poses[5]
     pixel = world.camera.project_ideal(hanging.inverse().transform(world.points))[[0]]
     dangling = replace(
@@ -122,7 +126,6 @@ def test_a_keyframe_that_hangs_on_one_landmark_is_unknown_alone(make_world):
         point_index=np.append(problem.point_index, 0).astype(np.int32),
         pixels=np.vstack([problem.pixels, pixel]),
         sigmas_px=np.append(problem.sigmas_px, 1.0),
-        level_sigma_rad=LEVEL_RAD * np.sqrt(len(problem.poses) / (len(problem.poses) + 1)),
     )
     found = pose_covariances(dangling)
     assert np.isnan(found[-1]).all()
