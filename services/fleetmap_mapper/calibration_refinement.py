@@ -47,8 +47,11 @@ def optimise(graph: CalibratedGraph, max_steps: int) -> tuple[State, float]:
     for _ in range(max_steps):
         images, rest = graph.linearised(state)
         while True:
-            moved = graph.moved(state, solve_bordered(images, rest, state.change, damping))
-            new_cost = graph.cost(moved)
+            try:
+                moved = graph.moved(state, solve_bordered(images, rest, state.change, damping))
+                new_cost = graph.cost(moved)
+            except (np.linalg.LinAlgError, RuntimeError):  # singular, says SuperLU by the latter: damp it more
+                new_cost = np.inf
             if new_cost < cost:
                 break
             damping *= 10.0
