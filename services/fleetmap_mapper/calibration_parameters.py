@@ -30,9 +30,12 @@ class CalibrationPrior:
 
     recorded: Camera
     sigmas: Array  # (C,) in the parameters' own units
+    is_held: bool = False  # then nothing moves the calibration, not even by a rounding error
 
     def camera(self, change: Array) -> Camera:
         """The camera after a change (C,) in prior sigmas."""
+        if self.is_held:
+            return self.recorded
         focal, aspect, dcx, dcy, *lens = (change * self.sigmas).tolist()
         r = self.recorded
         return replace(
@@ -46,6 +49,8 @@ class CalibrationPrior:
 
     def change(self, camera: Camera) -> Array:
         """The inverse of :meth:`camera`: (C,) in prior sigmas."""
+        if self.is_held:
+            return np.zeros(len(self.sigmas))
         x, y = np.log(camera.fx_px / self.recorded.fx_px), np.log(camera.fy_px / self.recorded.fy_px)
         centre = [camera.cx_px - self.recorded.cx_px, camera.cy_px - self.recorded.cy_px]
         lens = np.subtract(camera.distortion, self.recorded.distortion)
@@ -53,6 +58,8 @@ class CalibrationPrior:
 
     def pixel_jacobian(self, camera: Camera, normalised: Array) -> Array:
         """d recorded pixel / d change (N, 2, C) at normalised points (N, 2) of ``camera``."""
+        if self.is_held:
+            return np.zeros((len(normalised), 2, len(self.sigmas)))
         focal = np.array([camera.fx_px, camera.fy_px])
         reach = camera.distort(normalised * focal + [camera.cx_px, camera.cy_px]) - [camera.cx_px, camera.cy_px]
         columns = np.zeros((len(normalised), 2, len(self.sigmas)))

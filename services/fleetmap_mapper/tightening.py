@@ -34,7 +34,6 @@ _log = logging.getLogger(__name__)
 
 _ROUNDS = 2
 _NO_LEVEL_RAD = np.pi  # the direction of "down" is not asked for here
-_HELD = 1e-6  # of a prior's sigmas: a calibration that stays
 
 
 @dataclass(frozen=True)
@@ -94,8 +93,7 @@ def _adjusted_with_calibration(placed: PlacedMap, recorded: Camera, settings: Ca
 
 
 def _held(camera: Camera, settings: CalibrationGroup) -> CalibrationPrior:
-    prior = calibration_prior(camera, settings)
-    return replace(prior, sigmas=prior.sigmas * _HELD)
+    return replace(calibration_prior(camera, settings), is_held=True)
 
 
 def _adjusted(placed: PlacedMap, prior: CalibrationPrior) -> PlacedMap:
