@@ -92,7 +92,9 @@ def summary(report: MapReport) -> Iterator[tuple[str, str]]:
         yield "warning", warning
     for remark in quality.remarks:
         yield "remark", remark
-    yield "images posed", f"{quality.frames_posed} of {quality.frames_total}; {quality.keyframes} keyframes"
+    segments = f" in {quality.segments} segments" if quality.segments > 1 else ""
+    posed = f"{quality.frames_posed} of {quality.frames_total}{segments}"
+    yield "images posed", f"{posed}; {quality.keyframes} keyframes"
     yield "position", _position(report)
     yield "GNSS residual", _gnss_residual(report)
     if quality.clock_offset_s is not None:

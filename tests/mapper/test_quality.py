@@ -13,8 +13,8 @@ from fleetmap.geodesy import UtmAnchor
 from fleetmap.geometry import Sim3
 from fleetmap.manifest import Quality
 from fleetmap.trajectory import Trajectory
-from fleetmap_mapper.placed_map import PlacedMap
 from fleetmap_mapper.georeferencing import GnssTrack, PathPoint
+from fleetmap_mapper.placed_map import PlacedMap
 from fleetmap_mapper.quality import assess
 from fleetmap_mapper.road_quality import measure_road
 from fleetmap_mapper.settings import GnssGroup, MapperSettings, QualityGroup
@@ -54,6 +54,7 @@ def judge(make_world: Any) -> Callable[..., Quality]:
             np.zeros(len(pixels), np.int32),
             pixels,
             world.sigmas_px,
+            np.ones(len(pixels)),
             np.zeros(len(pixels), np.bool_),
             position_covariances_m2=np.tile(np.eye(3) * sigma_m**2, (KEYFRAMES, 1, 1)),
         )
@@ -123,3 +124,15 @@ def test_each_limit_is_a_setting(judge):
     assert judge(frames_total=30, gap_s=20.0, pixel_shift=3.0, settings=patient).publishable
     strict = with_limits(max_reprojection_rms_px=1.0, max_gnss_residual_sigmas=0.1)
     assert len(judge(settings=strict).warnings) == 2
+
+
+def test_a_mapped_drive_errs_about_as_much_as_it_says(mapped, survey):
+    """NEES of the keyframes' positions against the truth: 3 on average, for keyframes that err alike."""
+    keyframes = mapped.road_quality.keyframes
+    rows = np.searchsorted(survey.truth.stamps_ns // 1000, keyframes.stamps_ns // 1000)
+    errors_m = mapped.visual_map.anchor.utm_from_map(keyframes.positions_m) - survey.truth.positions_m[rows]
+    information = np.linalg.inv(keyframes.covariances_m2.astype(np.float64))
+    assert 0.5 < np.einsum("ki,kij,kj->k", errors_m, information, errors_m).mean() < 10.0
+    assert 0.01 < mapped.quality.position_sigma_m < 0.06
+    assert mapped.quality.weak_stretches == ()
+    assert mapped.quality.landmarks_per_m == pytest.approx(mapped.quality.landmarks / 60.0, rel=0.01)
