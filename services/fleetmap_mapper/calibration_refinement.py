@@ -36,7 +36,8 @@ def refine_calibration(problem: GlobalProblem, prior: CalibrationPrior) -> Refin
     graph = CalibratedGraph(problem, prior)
     state, cost = optimise(graph, _MAX_STEPS)
     refined = Refined(_renewed(problem, graph, state), graph.cost(graph.start), cost)
-    _log.info("calibration refined from %s to %s", problem.camera, refined.problem.camera)
+    if not prior.is_held:
+        _log.info("calibration refined from %s to %s", problem.camera, refined.problem.camera)
     return refined
 
 
