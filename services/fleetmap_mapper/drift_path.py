@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
-from fleetmap.geometry import Pose, Sim3, so3_exp, so3_log
+from fleetmap.geometry import Pose, Sim3, nearest_rotations, rotation_angle_rad, so3_exp, so3_log
 from fleetmap_mapper.georeferencing import MAX_IMAGE_GAP_NS, GnssTrack
 
 Array = NDArray[np.float64]
@@ -32,16 +32,20 @@ _NODE_SPACING_M = 1.0
 _MAX_NODES = 5_000
 _VELOCITY_BASE_NS = 400_000_000  # long enough for the path's jitter not to look like a change of speed
 _CLOCK_PRIOR_S = 0.3  # clocks further apart than some tenths are refused elsewhere
-_FREE = np.array(
+FREE = np.array(
     [1e3] * 3 + [0.05] * 3 + [1.0]
 )  # one step of the first node, m, rad, log: roll may be undetermined
 
 
 @dataclass(frozen=True)
 class DriftRates:
-    """What monocular odometry loses, per square root of a metre: 3 % of scale and 0.6 deg in 100 m."""
+    """What monocular odometry loses: 3 % of scale and 0.6 deg in 100 m, and 8 % of scale in a corner.
+
+    Per square root of a metre, and of a radian: where the camera turns, few landmarks carry the scale across.
+    """
 
     scale: float = 3e-3
+    scale_per_rad: float = 0.06
     turn_rad: float = 1e-3
     step_m: float = 0.01
 
@@ -53,6 +57,7 @@ class Chain:
     stamps_ns: Stamps  # (N,) of the camera's clock
     positions_m: Array  # (N, 3)
     rotations: Array  # (N, 3, 3) map_from_cam
+    turned_rad: Array  # (N - 1,) by the camera, from node to node
     fixes: Indices  # (F,) rows of the GnssTrack
     node_of: Indices  # (F,) node of each fix
     velocities_mps: Array  # (F, 3) of the antenna
@@ -136,6 +141,7 @@ def build_chain(placed: Timed, track: GnssTrack, clock_s: float = 0.0) -> Chain:
         stamps_ns,
         nodes.positions,
         nodes.rotations,
+        rotation_angle_rad(np.swapaxes(nodes.rotations[:-1], 1, 2) @ nodes.rotations[1:]),
         fixes,
         np.searchsorted(stamps_ns, fix_stamps_ns[fixes]),
         moved / (np.maximum(base_s, 1) * 1e-9)[:, None],
@@ -168,12 +174,22 @@ def _velocities(chain: Chain, bend: Bend) -> Array:
 
 
 def gauss_newton_step(
-    chain: Chain, bend: Bend, track: GnssTrack, information: Array, rates: DriftRates, with_clock: bool
+    chain: Chain,
+    bend: Bend,
+    track: GnssTrack,
+    information: Array,
+    rates: DriftRates,
+    with_clock: bool,
+    free: Array = FREE,
 ) -> Fit:
-    """Solve the system about ``bend``; ``information`` (F, 3, 3) of the fixes already carries robust weights."""
+    """Solve the system about ``bend``.
+
+    ``information`` (F, 3, 3) of the fixes already carries robust weights; ``free`` (7,) are the sigmas of what one
+    step may do to the first node, and thereby to all where the fixes do not determine it.
+    """
     residuals = track.positions_m[chain.fixes] - antennas_m(chain, bend, track.antenna_in_cam_m)[0]
     jacobian, velocities = antenna_jacobians(chain, bend, track.antenna_in_cam_m)
-    diagonal, below, gradient = _path_terms(chain, bend, rates)
+    diagonal, below, gradient = _path_terms(chain, bend, rates, free)
     weighted = np.swapaxes(jacobian, 1, 2) @ information  # (F, 7, 3)
     np.add.at(diagonal, chain.node_of, weighted @ jacobian)
     np.add.at(gradient, chain.node_of, np.einsum("fij,fj->fi", weighted, residuals))
@@ -251,11 +267,11 @@ def _walks(chain: Chain, bend: Bend, rates: DriftRates) -> tuple[Array, Array, A
     variances = np.empty((len(length), STATES))
     variances[:, :3] = (rates.step_m**2 * length + within)[:, None]
     variances[:, 3:6] = (rates.turn_rad**2 * length)[:, None]
-    variances[:, 6] = rates.scale**2 * length
+    variances[:, 6] = rates.scale**2 * length + rates.scale_per_rad**2 * chain.turned_rad
     return motions, errors, variances
 
 
-def _path_terms(chain: Chain, bend: Bend, rates: DriftRates) -> tuple[Array, Array, Array]:
+def _path_terms(chain: Chain, bend: Bend, rates: DriftRates, free: Array) -> tuple[Array, Array, Array]:
     """Normal equations of the random walks: diagonal blocks, blocks below them, right side (N, 7)."""
     motions, errors, variances = _walks(chain, bend, rates)
     weights = 1.0 / variances
@@ -265,7 +281,7 @@ def _path_terms(chain: Chain, bend: Bend, rates: DriftRates) -> tuple[Array, Arr
     below = weights[:, :, None] * from_here
     count = len(chain.positions_m)
     diagonal, gradient = np.zeros((count, STATES, STATES)), np.zeros((count, STATES))
-    diagonal[0] = np.diag(1.0 / _FREE**2)
+    diagonal[0] = np.diag(1.0 / free**2)
     diagonal[:-1] += np.swapaxes(from_here, 1, 2) @ below
     diagonal[1:] += weights[:, :, None] * np.eye(STATES)
     gradient[:-1] -= np.einsum("nji,nj->ni", below, errors)
@@ -274,7 +290,7 @@ def _path_terms(chain: Chain, bend: Bend, rates: DriftRates) -> tuple[Array, Arr
 
 
 def _moved(bend: Bend, steps: Array, clock_step_s: float) -> Bend:
-    turns = so3_exp(steps[:, 3:6]) @ bend.turns
+    turns = nearest_rotations(so3_exp(steps[:, 3:6]) @ bend.turns)
     scales = bend.scales * np.exp(np.clip(steps[:, 6], -0.7, 0.7))
     return replace(
         bend,

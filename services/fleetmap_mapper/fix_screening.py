@@ -19,7 +19,9 @@ _log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
-_CLEAR_SIGMAS = 3.0  # an offset smaller than this is none
+_CLEAR_SIGMAS = 4.0  # an offset smaller than this is none
+_FLOOR_S = 0.01  # exposure, lever arm and readout are not known better than this
+_MIN_FIXES = 15  # fewer cannot tell an offset from scale that was lost in the corners
 _DETERMINED_S = 0.05  # an offset less certain than this is none
 _CONVERGED_S = 0.002
 _ROUNDS = 4
@@ -31,11 +33,13 @@ class ClockOffset:
 
     offset_s: float
     sigma_s: float
+    fixes: int  # that it comes from
 
     @property
     def is_clear(self) -> bool:
         """Whether the drive proves that there is one."""
-        return self.sigma_s < _DETERMINED_S and abs(self.offset_s) > _CLEAR_SIGMAS * self.sigma_s
+        determined = self.sigma_s < _DETERMINED_S and self.fixes >= _MIN_FIXES
+        return determined and abs(self.offset_s) > _CLEAR_SIGMAS * self.sigma_s
 
 
 @dataclass(frozen=True)
@@ -102,7 +106,9 @@ def _combined(found: Sequence[Consensus], offset_s: float) -> ClockOffset | None
         return None
     weights = np.array([1.0 / c.clock_sigma_s**2 for c in found])
     left_s = np.array([c.bend.clock_s for c in found])
-    return ClockOffset(offset_s + float(weights @ left_s / weights.sum()), float(1.0 / np.sqrt(weights.sum())))
+    offset_s += float(weights @ left_s / weights.sum())
+    believed = sum(int(c.believed.sum()) for c in found)
+    return ClockOffset(offset_s, float(np.hypot(1.0 / np.sqrt(weights.sum()), _FLOOR_S)), believed)
 
 
 def _report(screened: ScreenedFixes, fixes: int) -> None:

@@ -14,8 +14,9 @@ from fleetmap.vision.absolute_pose import refine_absolute_pose
 from fleetmap_mapper.calibration_check import estimate_calibration
 from fleetmap_mapper.calibration_parameters import calibration_prior
 from fleetmap_mapper.calibration_refinement import refine_calibration, seen_anew
+from fleetmap_mapper.fix_terms import FixTerm
 from fleetmap_mapper.georeferencing import GnssTrack, path_at_fixes
-from fleetmap_mapper.global_adjustment import FixTerm, GlobalProblem, adjust_globally
+from fleetmap_mapper.global_adjustment import GlobalProblem, adjust_globally
 from fleetmap_mapper.growing_map import GrowingMap
 from fleetmap_mapper.observation_noise import observation_sigmas
 from fleetmap_mapper.placed_map import PlacedMap, without_outliers

@@ -19,20 +19,10 @@ from numpy.typing import NDArray
 
 from fleetmap.camera import Camera
 from fleetmap.geometry import Pose
-from fleetmap_mapper.georeferencing import HUBER_SIGMAS
+from fleetmap_mapper.fix_terms import FixTerm, add_gnss
 
 Array = NDArray[np.float64]
 _HUBER_PIXEL_SIGMAS = 2.4477  # 95 % of chi-square with 2 degrees of freedom
-
-
-@dataclass(frozen=True)
-class FixTerm:
-    """A fix carried to a keyframe by the visual motion between them: u = T_i * arm."""
-
-    keyframe: int
-    arm_in_cam_m: Array  # (3,) the antenna at the fix's time, seen from the keyframe's camera
-    position_m: Array  # (3,) in map
-    covariance_m2: Array  # (3, 3)
 
 
 @dataclass(frozen=True)
@@ -47,7 +37,7 @@ class GlobalProblem:
     pixels: Array  # (M, 2) undistorted
     sigmas_px: Array  # (M,)
     fixes: Sequence[FixTerm]
-    level_sigma_rad: float  # of the mean tilt of the camera's horizontal axis over the drive
+    level_sigma_rad: float  # of the mean tilt of the camera's horizontal axis, where fixes do not determine it
 
 
 @dataclass(frozen=True)
@@ -85,8 +75,7 @@ def adjust_globally(problem: GlobalProblem, max_iterations: int = 30) -> GlobalO
 def graph_without_images(problem: GlobalProblem) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
     """All that is known of the poses besides what they see, and where they start (keys X)."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    _add_fixes(graph, problem.fixes)
-    _add_level_prior(graph, len(problem.poses), problem.level_sigma_rad)
+    add_gnss(graph, problem.poses, problem.fixes, problem.level_sigma_rad)
     for i, pose in enumerate(problem.poses):
         values.insert(X(i), gtsam.Pose3(gtsam.Rot3(pose.rotation), pose.translation_m))
     return graph, values
@@ -111,27 +100,6 @@ def _add_observations(graph: gtsam.NonlinearFactorGraph, problem: GlobalProblem)
         graph.push_back(
             gtsam.GenericProjectionFactorCal3_S2(pixel, noises[sigma], X(i), L(j), calibration, False, False)
         )
-
-
-def _add_fixes(graph: gtsam.NonlinearFactorGraph, fixes: Sequence[FixTerm]) -> None:
-    huber = gtsam.noiseModel.mEstimator.Huber.Create(HUBER_SIGMAS)
-    for fix in fixes:
-        noise = gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Gaussian.Covariance(fix.covariance_m2))
-        graph.push_back(gtsam.GPSFactorArm(X(fix.keyframe), fix.position_m, fix.arm_in_cam_m, noise))
-
-
-def _add_level_prior(graph: gtsam.NonlinearFactorGraph, keyframes: int, sigma_rad: float) -> None:
-    """Holds the roll that the fixes of a straight drive leave free; spread over all keyframes it weighs as one."""
-    noise = gtsam.noiseModel.Isotropic.Sigma(1, sigma_rad * np.sqrt(keyframes))
-
-    def tilt(factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
-        R = values.atPose3(factor.keys()[0]).rotation().matrix()
-        if jacobians is not None:  # d (R exp(w))_31 = R_3. [w]x e_1 = R_32 w_3 - R_33 w_2
-            jacobians[0] = np.array([[0.0, -R[2, 2], R[2, 1], 0.0, 0.0, 0.0]])
-        return np.array([R[2, 0]])
-
-    for i in range(keyframes):
-        graph.push_back(gtsam.CustomFactor(noise, [X(i)], tilt))
 
 
 def _points_first(keyframes: int, points: int) -> gtsam.Ordering:

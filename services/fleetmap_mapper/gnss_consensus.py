@@ -76,7 +76,12 @@ class Consensus:
 
 
 def find_consensus(
-    timed: Timed, track: GnssTrack, clock_s: float = 0.0, with_clock: bool = True, seed: int = 0
+    timed: Timed,
+    track: GnssTrack,
+    clock_s: float = 0.0,
+    with_clock: bool = True,
+    seed: int = 0,
+    start: Sim3 | None = None,
 ) -> Consensus | None:
     """Hold all fixes against a camera path in a free-scale frame; None where there are too few of them.
 
@@ -86,8 +91,9 @@ def find_consensus(
         clock_s: what is known of the camera's stamp minus the receiver's stamp of the same instant.
         with_clock: whether what is left of that offset is estimated too, so that it is not taken for outliers.
         seed: of the sampling.
+        start: where the path is known to lie by and large; found by sampling if not.
     """
-    S = sample_similarity(timed, track, clock_s, seed)
+    S = start or sample_similarity(timed, track, clock_s, seed)
     if S is None:
         return None
     chain = build_chain(timed.placed(S), track, clock_s)

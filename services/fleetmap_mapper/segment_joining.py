@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from fleetmap.errors import InputError
 from fleetmap.geometry import Sim3
-from fleetmap_mapper.georeferencing import GnssTrack, georeference, path_at_fixes
+from fleetmap_mapper.georeferencing import GnssTrack, path_at_fixes
+from fleetmap_mapper.placement import georeference
 from fleetmap_mapper.refinding import tie_what_is_refound
 from fleetmap_mapper.relative_placing import place_beside
 from fleetmap_mapper.segments import join_segments

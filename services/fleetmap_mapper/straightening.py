@@ -11,19 +11,18 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.geometry import Sim3
+from fleetmap.geometry import Pose, Sim3, nearest_rotations
 from fleetmap_mapper.drift_path import Timed, bent
 from fleetmap_mapper.gnss_consensus import Consensus
 from fleetmap_mapper.growing_map import GrowingMap, Keyframe
 from fleetmap_mapper.slam import PosedFrame, Segment
 
 
-def straighten(growing: GrowingMap, consensus: Consensus) -> None:
-    """Bend a whole map, in its free-scale frame, as its path has been bent."""
-    S = consensus.map_from_vis
-    move_keyframes(
-        growing, growing.keyframes, [S.inverse() @ C @ S for C in local_moves(growing.keyframes, consensus)]
-    )
+def straighten(segment: Segment, consensus: Consensus) -> None:
+    """Bend a whole segment, in its free-scale frame, as its path has been bent."""
+    keyframes, S = segment.growing.keyframes, consensus.map_from_vis
+    moves = [S.inverse() @ move @ S for move in local_moves(keyframes, consensus)]
+    move_keyframes(segment.growing, keyframes, moves, segment.posed)
 
 
 def local_moves(keyframes: Sequence[Keyframe], consensus: Consensus) -> list[Sim3]:
@@ -31,7 +30,7 @@ def local_moves(keyframes: Sequence[Keyframe], consensus: Consensus) -> list[Sim
     stamps_ns = np.array([k.stamp_ns for k in keyframes], dtype=np.int64)
     placed = Timed.of(stamps_ns, [k.vis_from_cam for k in keyframes]).placed(consensus.map_from_vis)
     moved, scales = bent(placed, consensus.chain, consensus.bend)
-    turns = moved.rotations @ np.swapaxes(placed.rotations, 1, 2)
+    turns = nearest_rotations(moved.rotations @ np.swapaxes(placed.rotations, 1, 2))
     return [
         Sim3(float(s), turn, after - s * turn @ before)
         for s, turn, before, after in zip(scales, turns, placed.positions, moved.positions, strict=True)
@@ -47,7 +46,8 @@ def move_keyframes(
         if frame.keyframe.index >= first:
             frame.keyframe_from_cam.translation_m[:] *= moves[frame.keyframe.index - first].scale
     for keyframe, move in zip(keyframes, moves, strict=True):
-        keyframe.vis_from_cam = move.transform_pose(keyframe.vis_from_cam)
+        pose = move.transform_pose(keyframe.vis_from_cam)
+        keyframe.vis_from_cam = Pose(nearest_rotations(pose.rotation), pose.translation_m)
     landmarks = growing.landmarks_of(keyframes)
     rows: NDArray[np.int64] = growing.reference[landmarks] - first
     landmarks, rows = landmarks[rows >= 0], rows[rows >= 0]

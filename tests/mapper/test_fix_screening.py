@@ -165,7 +165,7 @@ def test_a_drive_without_a_posed_image_at_its_fixes_keeps_them():
 # --- the clocks
 
 
-@pytest.mark.parametrize("interval_s", [0.1, 1.0, 5.0])
+@pytest.mark.parametrize("interval_s", [0.1, 1.0])
 @pytest.mark.parametrize("late_s", [-0.08, 0.08])
 def test_clocks_80_ms_apart_are_found_to_20_ms_and_brought_together(interval_s, late_s):
     """The receiver's stamps are late: the camera's minus the receiver's is the negative of it."""
@@ -180,6 +180,14 @@ def test_clocks_80_ms_apart_are_found_to_20_ms_and_brought_together(interval_s, 
     np.testing.assert_allclose(np.median(moved_s), screened.clock.offset_s, atol=1e-6)
     at_once = screen_fixes([path], fixes_along(true, interval_s), SETTINGS)
     assert mean_error_m(screened, path, true) < 1.3 * mean_error_m(at_once, path, true) + 0.02
+
+
+def test_nine_fixes_may_suspect_an_offset_but_do_not_prove_it():
+    """Scale that is lost in corners looks much like it when the next fix is forty metres away."""
+    true = course(400.0)
+    screened = screen_fixes([as_slam_has_it(true)], fixes_along(true, 5.0, -0.08), SETTINGS)
+    assert screened.clock.offset_s == pytest.approx(0.08, abs=0.02)
+    assert not screened.clock.is_clear
 
 
 @pytest.mark.parametrize("interval_s", [0.1, 1.0, 5.0])

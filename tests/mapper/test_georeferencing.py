@@ -12,7 +12,8 @@ from fleetmap.drive import GnssFix
 from fleetmap.errors import DriveError
 from fleetmap.geodesy import UtmAnchor, UtmGrid
 from fleetmap.geometry import Pose, Sim3, rotation_angle_rad, so3_exp, umeyama_alignment
-from fleetmap_mapper.georeferencing import GnssTrack, PathPoint, georeference, gnss_track, path_at_fixes
+from fleetmap_mapper.georeferencing import GnssTrack, PathPoint, gnss_track, path_at_fixes
+from fleetmap_mapper.placement import georeference
 
 ANCHOR = UtmAnchor(32632, 678_000, 5_404_000, 420)
 VIS_FROM_MAP = Sim3(0.21, so3_exp(np.array([1.1, -0.7, 0.4])), np.array([3.0, -2.0, 7.0]))

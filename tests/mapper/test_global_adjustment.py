@@ -13,8 +13,9 @@ import pytest
 from gtsam.symbol_shorthand import L, S, X
 
 from fleetmap.geometry import Pose, Sim3, rotation_angle_rad, so3_exp, umeyama_alignment
+from fleetmap_mapper.fix_terms import FixTerm
 from fleetmap_mapper.georeferencing import HUBER_SIGMAS
-from fleetmap_mapper.global_adjustment import FixTerm, GlobalOptimum, GlobalProblem, adjust_globally
+from fleetmap_mapper.global_adjustment import GlobalOptimum, GlobalProblem, adjust_globally
 
 SIGMA_M = 0.05
 NO_LEVEL = 1e6  # rad: as good as no prior
