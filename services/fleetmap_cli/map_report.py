@@ -12,13 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.files import write_text_atomically
 from fleetmap.manifest import Manifest, Quality, WeakStretch
 from fleetmap.map_package import open_package
 from fleetmap.road_quality import RoadQuality
 from fleetmap.visual_map import LocalizationMap
 
-PAGE_NAME, PICTURE_NAME = "report.html", "report.png"
 _LABEL_WIDTH = 16
 
 
@@ -64,21 +62,6 @@ def read_report(folder: Path) -> MapReport:
     """
     package = open_package(folder)
     return MapReport(folder, package.version, package.manifest, package.localization_map(), package.road_quality())
-
-
-def write_report(report: MapReport, folder: Path) -> list[Path]:
-    """Write page and picture into a folder, made where there is none; older ones are replaced.
-
-    Raises:
-        StorageError: the disk is full or refuses.
-    """
-    from fleetmap_cli.map_report_page import page
-    from fleetmap_cli.map_report_picture import draw_report
-
-    picture = folder / PICTURE_NAME
-    draw_report(report, picture)
-    write_text_atomically(folder / PAGE_NAME, page(report, picture.read_bytes()))
-    return [folder / PAGE_NAME, picture]
 
 
 def summary(report: MapReport) -> Iterator[tuple[str, str]]:

@@ -5,9 +5,12 @@ from __future__ import annotations
 import base64
 from collections.abc import Iterable, Sequence
 from html import escape
+from pathlib import Path
 
+from fleetmap.files import write_text_atomically
 from fleetmap.manifest import WeakStretch
 from fleetmap_cli.map_report import MapReport, summary
+from fleetmap_cli.map_report_picture import draw_report
 
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #222; max-width: 1240px; margin: 2em auto; padding: 0 1em; }
@@ -23,6 +26,18 @@ _NOTE = (
     "the drive err by together, such as the slow bias of one receiver, is not in them: one drive cannot see it. "
     "How large that may be, the receiver's own claim tells."
 )
+
+
+def write_report(report: MapReport, folder: Path) -> list[Path]:
+    """Write page and picture into a folder, made where there is none; older ones are replaced.
+
+    Raises:
+        StorageError: the disk is full or refuses.
+    """
+    written, picture = folder / "report.html", folder / "report.png"
+    draw_report(report, picture)
+    write_text_atomically(written, page(report, picture.read_bytes()))
+    return [written, picture]
 
 
 def page(report: MapReport, picture_png: bytes) -> str:

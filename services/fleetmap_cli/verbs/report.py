@@ -7,7 +7,8 @@ from pathlib import Path
 
 import click
 
-from fleetmap_cli.map_report import document, lines, read_report, write_report
+from fleetmap_cli.map_report import document, lines, read_report
+from fleetmap_cli.map_report_page import write_report
 
 _PATH = click.Path(path_type=Path)
 
