@@ -118,3 +118,59 @@ def test_only_the_latest_keyframes_and_their_landmarks_move(make_world):
     )
     assert len(behind) > 20
     np.testing.assert_array_equal(growing.points[behind], points[behind])
+
+
+def shrunk_after(world, growing, posed, first: int, scale: float) -> None:
+    """From a keyframe on the map has lost scale, with its landmarks, as monocular vision does in a corner."""
+    centre = growing.keyframes[first].vis_from_cam.translation_m.copy()
+    for keyframe in growing.keyframes[first:]:
+        pose = keyframe.vis_from_cam
+        keyframe.vis_from_cam = Pose(pose.rotation, centre + scale * (pose.translation_m - centre))
+    rows = np.flatnonzero(growing.reference[: growing.landmark_count] >= first)
+    growing.points[rows] = centre + scale * (growing.points[rows] - centre)
+
+
+def aligned(world, spoil=lambda positions: None, fixes=slice(None)):
+    growing, posed = growing_along(world)
+    shrunk_after(world, growing, posed, 20, 0.94)
+    positions = world.centres.copy()
+    spoil(positions)
+    stamps_ns = np.arange(40) * 10**9
+    settings = MapperSettings(mapping=MappingGroup(window=4))
+    GnssAligner(track_of(positions[fixes], stamps_ns[fixes]), settings)(growing, posed)
+    centres = np.array([p.vis_from_cam.translation_m for p in posed])
+    S = umeyama_alignment(centres, world.centres)
+    errors = np.linalg.norm(S.transform(centres) - world.centres, axis=1)
+    steps = np.linalg.norm(np.diff(S.transform(centres), axis=0), axis=1)
+    return float(errors.mean()), steps, growing, S
+
+
+@pytest.fixture(scope="module")
+def forty(make_world):
+    return make_world(keyframes=40, points=800, step_m=2.0)
+
+
+def test_lost_scale_is_given_back_and_landmarks_follow(forty):
+    mean_m, steps, growing, S = aligned(forty)
+    assert 0.0 < mean_m < 0.1
+    np.testing.assert_allclose(steps, 2.0, atol=0.15)
+    alive = growing.reference[: growing.landmark_count] >= 22
+    placed = S.transform(growing.points[: growing.landmark_count][alive])
+    assert np.median(np.linalg.norm(placed - forty.points[alive], axis=1)) < 0.4
+
+
+def test_a_stretch_without_fixes_is_crossed_smoothly(forty):
+    """Fixes fail from 24 to 48 m; scale was lost at 40 m. The corrections bend the path, they do not break it."""
+    tunnel = np.r_[0:12, 24:40]
+    mean_m, steps, _, _ = aligned(forty, fixes=tunnel)
+    assert 0.0 < mean_m < 0.3
+    assert np.abs(np.diff(steps)).max() < 0.2
+
+
+def test_fixes_that_are_far_off_do_not_move_the_map(forty):
+    def spoil(positions):
+        positions[[3, 9, 16, 29, 36]] += [[9, 4, 2], [-20, 3, 1], [0, 30, 5], [-8, 1, 0], [12, -12, 3]]
+
+    clean_m, *_ = aligned(forty)
+    mean_m, *_ = aligned(forty, spoil)
+    assert 0.0 < mean_m < 1.5 * clean_m + 0.02
