@@ -41,7 +41,7 @@ def with_estimated_noise(placed: PlacedMap) -> PlacedMap:
         if np.count_nonzero(usable) >= _MIN_OBSERVATIONS:
             factors[kind] = np.clip(np.sqrt(np.median(chi2[usable]) / _MEDIAN_2DOF), *_FACTOR_RANGE)
     correlation = _correlation(errors / factors[:, None], placed, lengths)
-    return replace(placed, sigmas_px=placed.sigmas_px * factors, track_correlation=correlation)
+    return replace(placed, noise=placed.noise * factors, track_correlation=correlation)
 
 
 def observation_sigmas(placed: PlacedMap) -> Array:

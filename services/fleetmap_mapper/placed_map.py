@@ -32,11 +32,17 @@ class PlacedMap:
     point_index: NDArray[np.int32]  # (M,)
     feature_index: NDArray[np.int32]  # (M,) feature of the keyframe
     pixels: Array  # (M, 2) undistorted
-    sigmas_px: Array  # (M,)
+    corner_sigmas_px: Array  # (M,) one pixel of the octave that the feature was found on, as undistorted
+    noise: Array  # (M,) how exact the observation is, against that
     is_aligned: NDArray[np.bool_]  # (M,) whether the pixel comes from aligning patches, or is a corner's
     track_correlation: float = 0.0  # of errors from one observation of a landmark to the next
     position_covariances_m2: Array | None = None  # (K, 3, 3) of the final graph; NaN where no fix determines it
     calibration: CalibrationEstimate | None = None  # as the final graph has it
+
+    @property
+    def sigmas_px(self) -> Array:
+        """Sigma of each observation (M,)."""
+        return self.corner_sigmas_px * self.noise
 
 
 def place(growing: GrowingMap, map_from_vis: Sim3) -> PlacedMap:
@@ -56,7 +62,6 @@ def place(growing: GrowingMap, map_from_vis: Sim3) -> PlacedMap:
     seen, index, feature = seen[often], index[often], feature[often]
     ids, point_index = np.unique(seen, return_inverse=True)
     own = [(k, feature[index == k.index]) for k in growing.keyframes]
-    sigmas = np.concatenate([(k.features.sigmas_px * k.noise)[rows] for k, rows in own])
     pixels = np.concatenate([k.features.pixels[rows] for k, rows in own])
     return PlacedMap(
         growing.camera,
@@ -69,7 +74,8 @@ def place(growing: GrowingMap, map_from_vis: Sim3) -> PlacedMap:
         point_index.astype(np.int32),
         feature,
         pixels,
-        sigmas,
+        np.concatenate([k.features.sigmas_px[rows] for k, rows in own]),
+        np.concatenate([k.noise[rows] for k, rows in own]),
         np.concatenate([k.is_aligned[rows] for k, rows in own]),
         growing.track_correlation,
     )
@@ -100,6 +106,7 @@ def without_outliers(placed: PlacedMap) -> PlacedMap:
         point_index=point_index.astype(np.int32),
         feature_index=placed.feature_index[good],
         pixels=placed.pixels[good],
-        sigmas_px=placed.sigmas_px[good],
+        corner_sigmas_px=placed.corner_sigmas_px[good],
+        noise=placed.noise[good],
         is_aligned=placed.is_aligned[good],
     )

@@ -98,7 +98,7 @@ def _weakness(quality: Quality, limits: QualityGroup) -> Iterator[str]:
 
 
 def _reprojection_rms_px(placed: PlacedMap) -> float:
-    errors = reprojection_errors_px(placed) / placed.sigmas_px[:, None]
+    errors = reprojection_errors_px(placed) / placed.corner_sigmas_px[:, None]
     return float(np.sqrt(np.nanmean((errors**2).sum(axis=1))))
 
 

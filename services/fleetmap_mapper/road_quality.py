@@ -49,7 +49,7 @@ def _along_m(trajectory: Trajectory, stamps_ns: NDArray[np.int64]) -> Array:
 
 def _keyframe_quality(placed: PlacedMap, trajectory: Trajectory) -> KeyframeQuality:
     count = len(placed.poses)
-    squares = ((reprojection_errors_px(placed) / placed.sigmas_px[:, None]) ** 2).sum(axis=1)
+    squares = ((reprojection_errors_px(placed) / placed.corner_sigmas_px[:, None]) ** 2).sum(axis=1)
     counted = np.isfinite(squares)
     index = placed.keyframe_index[counted]
     seen = np.bincount(index, minlength=count)

@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 _LEVELS = 8
 _IMAGES_AHEAD = 2
 _MAX_SHIFT_SIGMAS = 2.5  # of the corner's own sigma
-_ALIGNED_SIGMA = 0.25  # of a corner's; a first guess
+_ALIGNED_NOISE = 0.25  # against a corner's sigma; a first guess
 _WARP_BASELINE_PX = 2.0  # finite difference, in pixels of the patch's level
 
 
@@ -49,7 +49,7 @@ def align_observations(
     refined, aligned = recorded.copy(), np.zeros(len(recorded), np.bool_)
     is_reference = np.zeros(len(recorded), np.bool_)
     is_reference[reference] = True
-    corner_sigmas_px = SCALE_FACTOR ** octaves.astype(np.float64)
+    recorded_sigmas_px = SCALE_FACTOR ** octaves.astype(np.float64)
     for keyframe, pyramid in _keyframe_pyramids(placed, frames):
         rows = np.flatnonzero((placed.keyframe_index == keyframe) & ~is_reference)
         refined[rows], aligned[rows] = align_patches(
@@ -58,7 +58,7 @@ def align_observations(
             patches[placed.point_index[rows]],
             warps[rows],
             recorded[rows],
-            _MAX_SHIFT_SIGMAS * corner_sigmas_px[rows],
+            _MAX_SHIFT_SIGMAS * recorded_sigmas_px[rows],
         )
     # The reference's own corner is the landmark, wherever it was found, if anything agrees with it.
     followed = np.bincount(placed.point_index[aligned], minlength=len(placed.points_m)) > 0
@@ -68,7 +68,7 @@ def align_observations(
     return replace(
         placed,
         pixels=np.where(lost[:, None], placed.pixels, pixels),
-        sigmas_px=placed.sigmas_px * np.where(aligned & ~lost, _ALIGNED_SIGMA, 1.0),
+        noise=np.where(aligned & ~lost, _ALIGNED_NOISE, 1.0),
         is_aligned=aligned & ~lost,
     )
 

@@ -154,11 +154,10 @@ def _renew_observations(
     growing: GrowingMap, index: int, placed: PlacedMap, rows: NDArray[np.bool_], before: Camera
 ) -> None:
     keyframe, features = growing.keyframes[index], placed.feature_index[rows]
-    corner_sigmas_px = keyframe.features.sigmas_px
     pixels = seen_anew(keyframe.features.pixels, before, placed.camera)
     pixels[features] = placed.pixels[rows]
     keyframe.features = replace(keyframe.features, pixels=pixels)
-    keyframe.noise[features] = placed.sigmas_px[rows] / corner_sigmas_px[features]
+    keyframe.noise[features] = placed.noise[rows]
     keyframe.is_aligned[features] = placed.is_aligned[rows]
     held = np.flatnonzero(keyframe.landmark_of >= 0)
     growing.forget(keyframe, np.setdiff1d(held, features))

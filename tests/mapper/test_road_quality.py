@@ -36,6 +36,7 @@ def straight(make_world: Any) -> tuple[PlacedMap, Trajectory]:
         np.zeros(len(world.pixels), np.int32),
         world.pixels,
         world.sigmas_px,
+        np.ones(len(world.pixels)),
         np.zeros(len(world.pixels), np.bool_),
     )
     rotations = np.array([pose.rotation for pose in world.poses])
@@ -80,7 +81,9 @@ def test_landmarks_count_where_they_are_seen_from(straight):
         keyframe_index=placed.keyframe_index[there],
         point_index=placed.point_index[there],
         pixels=placed.pixels[there],
-        sigmas_px=placed.sigmas_px[there],
+        corner_sigmas_px=placed.corner_sigmas_px[there],
+        noise=placed.noise[there],
+        is_aligned=placed.is_aligned[there],
         feature_index=placed.feature_index[there],
     )
     density = road_of(placed, trajectory).landmarks_per_m
