@@ -15,10 +15,12 @@ from fleetmap_mapper.calibration_check import (
     calibration_record,
     calibration_remarks,
     estimate_calibration,
+    is_contradicted,
 )
 from fleetmap_mapper.calibration_parameters import calibration_prior
 from fleetmap_mapper.calibration_refinement import Refined, refine_calibration, seen_anew
-from fleetmap_mapper.global_adjustment import FixTerm, GlobalProblem, adjust_globally
+from fleetmap_mapper.fix_terms import FixTerm
+from fleetmap_mapper.global_adjustment import GlobalProblem, adjust_globally
 from fleetmap_mapper.settings import CalibrationGroup
 
 Array = NDArray[np.float64]
@@ -146,10 +148,10 @@ def test_refining_ends_in_the_joint_optimum_wherever_it_starts(recorded):
         sigmas_px=here.sigmas_px * true.magnification(pixels) / recorded.magnification(here.pixels),
     )
     a, b = refined(here, recorded), refined(there, recorded)
-    assert a.cost == pytest.approx(b.cost, rel=2e-6)
+    assert a.cost == pytest.approx(b.cost, rel=1e-5)
     assert largest_shift_px(a.problem.camera, b.problem.camera) < 0.2
     again = refined(a.problem, recorded)
-    assert again.cost == pytest.approx(a.cost, rel=1e-6)
+    assert again.cost == pytest.approx(a.cost, rel=1e-5)
 
 
 def test_on_a_straight_road_what_the_drive_does_not_determine_stays_where_it_was():
@@ -158,6 +160,15 @@ def test_on_a_straight_road_what_the_drive_does_not_determine_stays_where_it_was
     assert abs(camera.fx_px - BROWN.fx_px) < prior_px
     estimate = checked(driven(BROWN, BROWN, seed=3, straight=True))
     assert 0.7 * prior_px < estimate.focal_sigma_px < 1.2 * prior_px
+
+
+def test_a_calibration_that_is_held_stays_to_the_last_bit_while_poses_and_points_move():
+    problem = driven(off(BROWN), BROWN, seed=4)
+    shifted = replace(problem, points_m=problem.points_m + np.random.default_rng(0).normal(0.0, 0.1, (1, 3)))
+    result = refine_calibration(shifted, replace(calibration_prior(BROWN, SETTINGS), is_held=True))
+    assert result.problem.camera == BROWN
+    assert np.array_equal(result.problem.pixels, problem.pixels)
+    assert result.cost < 0.9 * result.initial_cost
 
 
 def test_the_refined_pixels_are_the_recorded_ones_undistorted_anew():
@@ -176,9 +187,13 @@ def test_a_wrong_calibration_is_told_with_numbers(recorded):
     fitted_px = float(np.sqrt(estimate.fitted.fx_px * estimate.fitted.fy_px))
     assert abs(fitted_px - mean_px) < 4.0 * estimate.focal_sigma_px
     assert 0.0005 * mean_px < estimate.focal_sigma_px < 0.01 * mean_px
-    remarks = calibration_remarks(estimate, SETTINGS)
+    remarks = calibration_remarks(estimate, recorded, SETTINGS)
     assert remarks
     assert all(line.endswith("recalibrate, or map with --refine-calibration") for line in remarks)
+    assert all(
+        "the drive's own calibration; recalibrate" in r for r in calibration_remarks(estimate, true, SETTINGS)
+    )
+    assert is_contradicted(estimate, SETTINGS)
     if recorded is BROWN:
         assert remarks[0].startswith(
             f"the recorded focal length 601.0 px disagrees with the drive: {fitted_px:.1f} +- "
@@ -190,7 +205,8 @@ def test_a_wrong_calibration_is_told_with_numbers(recorded):
 @pytest.mark.parametrize("correlated_px", [0.0, 1.0], ids=["white noise", "noise along tracks"])
 def test_a_right_calibration_is_left_in_peace(seed, correlated_px):
     estimate = checked(driven(BROWN, BROWN, seed=10 + seed, correlated_px=correlated_px))
-    assert calibration_remarks(estimate, SETTINGS) == []
+    assert calibration_remarks(estimate, BROWN, SETTINGS) == []
+    assert not is_contradicted(estimate, SETTINGS)
     assert abs(estimate.fitted.fx_px - BROWN.fx_px) < 4.0 * estimate.focal_sigma_px
 
 
@@ -198,7 +214,7 @@ def test_a_right_calibration_is_left_in_peace(seed, correlated_px):
 def test_on_a_straight_road_a_wrong_focal_length_cannot_be_told(seed):
     longer = replace(BROWN, fx_px=1.02 * BROWN.fx_px, fy_px=1.02 * BROWN.fy_px)
     estimate = checked(driven(longer, BROWN, seed=20 + seed, straight=True))
-    assert not any("focal length" in line for line in calibration_remarks(estimate, SETTINGS))
+    assert not any("focal length" in line for line in calibration_remarks(estimate, BROWN, SETTINGS))
 
 
 def test_the_sigmas_told_are_those_of_the_spread_over_many_drives():
@@ -208,15 +224,15 @@ def test_the_sigmas_told_are_those_of_the_spread_over_many_drives():
 
 
 def test_once_refined_nothing_is_remarked_and_the_record_tells_before_and_after():
-    settings = replace_refine(SETTINGS)
+    settings = CalibrationGroup(mode="refined")
     estimate = checked(driven(off(BROWN), BROWN, seed=6))
-    assert calibration_remarks(estimate, settings) == []
-    record = calibration_record(estimate, off(BROWN), settings)
+    assert calibration_remarks(estimate, off(BROWN), settings) == []
+    record = calibration_record(estimate, off(BROWN))
     assert record is not None
     assert record.refined
     assert (record.recorded.to_camera(), record.fitted.to_camera()) == (BROWN, off(BROWN))
-    assert calibration_record(None, BROWN, settings) is None
-
-
-def replace_refine(settings: CalibrationGroup) -> CalibrationGroup:
-    return settings.model_copy(update={"refine": True})
+    untouched = calibration_record(estimate, BROWN)
+    assert untouched is not None
+    assert not untouched.refined
+    assert untouched.fitted.to_camera() == estimate.fitted
+    assert calibration_record(None, BROWN) is None
