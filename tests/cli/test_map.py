@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 
 from fleetmap.drive import Frame
+from fleetmap.drives.image_codec import encode_image
 from fleetmap.gnss import RTK, sample_fixes
 from fleetmap.manifest import manifest_version
 from fleetmap.map_package import open_package
@@ -148,6 +149,16 @@ def test_an_antenna_behind_and_to_the_right_is_given_with_a_leading_minus(
     code, _, err = fleetmap(*arguments, "--antenna-offset", "-0.7,-0.4,1.2")  # forward, left, up
     assert (code, err) == (0, "")
     assert 0.005 < survey.errors_m(read_trajectory(trajectory)).mean() < 0.15
+
+
+def test_a_mask_of_another_size_is_refused_before_anything_is_mapped(fleetmap, short_drive, tmp_path):
+    mask, output = tmp_path / "mask.png", tmp_path / "m"
+    mask.write_bytes(encode_image(np.full((100, 200), 255, np.uint8), png=True))
+    code, out, err = fleetmap("map", short_drive, "--output", output, "--mask", mask)
+    assert (code, out) == (2, "")
+    assert f"the mask {mask} is 200x100, but the images are 640x320" in err
+    assert err.count("\n") == 1
+    assert not output.exists()
 
 
 @pytest.mark.parametrize(
