@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -20,7 +19,6 @@ from fleetmap_mapper.segments import join_segments
 from fleetmap_mapper.settings import MapperSettings
 from fleetmap_mapper.slam import Segment
 
-_log = logging.getLogger(__name__)
 _SEEN_AGAIN = 2  # keyframes: two neighbours that agree, at least
 
 
@@ -56,8 +54,7 @@ def place_segments(segments: Sequence[Segment], track: GnssTrack, settings: Mapp
         for i, j in itertools.pairwise(order)
     ]
     for index in sorted(set(range(len(segments))) - set(order)):
-        remarks.append(_left_out(segments[index], track, refusals[index]))
-        _log.warning(remarks[-1])
+        remarks.append(_left_out(segments[index], refusals[index]))
     return JoinedSegments(joined, placements[order[0]], len(order), tuple(remarks))
 
 
@@ -121,5 +118,5 @@ def _join_remark(
     )
 
 
-def _left_out(segment: Segment, track: GnssTrack, refusal: InputError) -> str:
+def _left_out(segment: Segment, refusal: InputError) -> str:
     return f"a stretch of {len(segment.posed)} images is left out of the map: {refusal}"
