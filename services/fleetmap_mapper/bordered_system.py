@@ -34,6 +34,7 @@ class LinearisedImages:
     keyframe_index: IntArray  # (M,)
     starts: IntArray  # (P + 1,) first observation of each point
     keyframes: int
+    shared_blocks: tuple[IntArray, IntArray]  # see the function of this name
 
 
 @dataclass(frozen=True)
@@ -94,32 +95,27 @@ def solve_bordered(images: LinearisedImages, rest: LinearisedRest, change: Array
 
 
 def _eliminate_points(images: LinearisedImages, damping: float) -> _WithoutPoints:
-    by_pose, by_point, by_calibration = images.by_pose, images.by_point, images.by_calibration
-    r, K, P = images.residuals[:, :, None], images.keyframes, len(images.starts) - 1
-    point_index, k = np.repeat(np.arange(P), np.diff(images.starts)), images.keyframe_index
-    V = sum_rows(_products(by_point, by_point), point_index, P)
-    V += np.eye(3) * (damping * V + 1e-12)
-    V_inverse = np.asarray(np.linalg.inv(V), dtype=np.float64)
-    gl = sum_rows(_products(by_point, r), point_index, P)
-    W = _products(by_pose, by_point)
-    Wc = sum_rows(_products(by_calibration, by_point), point_index, P)
-    WV, WcV = W @ V_inverse[point_index], Wc @ V_inverse
-    S_pc = _products(by_pose, by_calibration) - WV @ Wc.transpose(0, 2, 1)[point_index]
-    b_p = _products(by_pose, r) - WV @ gl[point_index]
-    flat = by_calibration.reshape(-1, by_calibration.shape[2])
-    U = sum_rows(_products(by_pose, by_pose), k, K)
-    return _WithoutPoints(
-        _pose_system(U, W, WV, images),
-        sum_rows(S_pc, k, K).reshape(6 * K, -1),
-        sum_rows(b_p, k, K).ravel(),
-        flat.T @ flat - (WcV @ Wc.transpose(0, 2, 1)).sum(axis=0),
-        flat.T @ images.residuals.ravel() - (WcV @ gl).sum(axis=0)[:, 0],
-        V_inverse,
-        gl[:, :, 0],
-        W,
-        Wc,
-        point_index,
+    places, slots = images.shared_blocks
+    K, P, C = images.keyframes, len(images.starts) - 1, images.by_calibration.shape[2]
+    M = len(images.residuals)
+    blocks, U = np.zeros((len(places), 6, 6)), np.zeros((K, 6, 6))
+    S_pc, b_p, S_cc, b_c = np.zeros((K, 6, C)), np.zeros((K, 6)), np.zeros((C, C)), np.zeros(C)
+    V_inverse, gl = np.empty((P, 3, 3)), np.zeros((P, 3))
+    W, Wc = np.zeros((M, 6, 3)), np.zeros((P, C, 3))
+    _eliminate(
+        np.ascontiguousarray(images.residuals),
+        np.ascontiguousarray(images.by_pose),
+        np.ascontiguousarray(images.by_point),
+        np.ascontiguousarray(images.by_calibration),
+        images.keyframe_index,
+        images.starts,
+        slots,
+        damping,
+        (blocks, U, S_pc, b_p, S_cc, b_c, V_inverse, gl, W, Wc),
     )
+    point_index = np.repeat(np.arange(P), np.diff(images.starts))
+    S_pp = _pose_system(blocks, U, places)
+    return _WithoutPoints(S_pp, S_pc.reshape(6 * K, C), b_p.ravel(), S_cc, b_c, V_inverse, gl, W, Wc, point_index)
 
 
 def _products(a: Array, b: Array) -> Array:
@@ -146,14 +142,19 @@ def sum_rows(values: Array, index: IntArray, count: int) -> Array:
     return np.asarray(picker @ flat).reshape(count, *values.shape[1:])
 
 
-def _pose_system(U: Array, W: Array, WV: Array, images: LinearisedImages) -> sp.csc_matrix:
+def shared_blocks(keyframe_index: IntArray, starts: IntArray, keyframes: int) -> tuple[IntArray, IntArray]:
+    """Blocks of the upper triangle that share points, as row * K + column (B,), and the one that each pair of
+    observations of a point fills (Q,)."""
+    places, slots = np.unique(_places(keyframe_index, starts, keyframes), return_inverse=True)
+    return places, np.asarray(slots, dtype=np.int64)
+
+
+def _pose_system(blocks: Array, U: Array, places: IntArray) -> sp.csc_matrix:
     """The reduced camera system (6 K, 6 K), symmetric and sparse: keyframes that share no point have no block."""
-    places, slots = np.unique(_places(images.keyframe_index, images.starts, images.keyframes), return_inverse=True)
-    blocks = np.zeros((len(places), 6, 6))
-    _subtract_products(blocks, slots, W, WV, images.keyframe_index, images.starts)
-    rows, columns = places // images.keyframes, places % images.keyframes
+    keyframes = len(U)
+    rows, columns = places // keyframes, places % keyframes
     upper = rows < columns
-    own = np.arange(images.keyframes)
+    own = np.arange(keyframes)
     blocks = np.concatenate([blocks, blocks[upper].transpose(0, 2, 1), U])
     rows, columns = (
         np.concatenate([rows, columns[upper], own]),
@@ -162,7 +163,7 @@ def _pose_system(U: Array, W: Array, WV: Array, images: LinearisedImages) -> sp.
     six = np.arange(6)
     i = np.broadcast_to(6 * rows[:, None, None] + six[:, None], blocks.shape)
     j = np.broadcast_to(6 * columns[:, None, None] + six, blocks.shape)
-    side = 6 * images.keyframes
+    side = 6 * keyframes
     return sp.csc_matrix((blocks.ravel(), (i.ravel(), j.ravel())), shape=(side, side))
 
 
@@ -193,19 +194,86 @@ def _places(keyframe_index, starts, keyframes):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _subtract_products(blocks, slots, W, WV, keyframe_index, starts):  # type: ignore[no-untyped-def]
-    """blocks[slot of (a, b)] -= W_a V^-1 W_b^T, in the order of :func:`_places`."""
-    n = 0
+def _add_products(target, a, b):  # type: ignore[no-untyped-def]
+    """target += a^T b, for a (2, i) and b (2, j)."""
+    for c in range(target.shape[0]):
+        for d in range(target.shape[1]):
+            target[c, d] += a[0, c] * b[0, d] + a[1, c] * b[1, d]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _multiply(a, b, target):  # type: ignore[no-untyped-def]
+    """target = a b, for a (n, 3) and b (3, 3)."""
+    for c in range(a.shape[0]):
+        for d in range(3):
+            target[c, d] = a[c, 0] * b[0, d] + a[c, 1] * b[1, d] + a[c, 2] * b[2, d]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _subtract_outer(target, a, b):  # type: ignore[no-untyped-def]
+    """target -= a b^T, for a (n, 3) and b (m, 3)."""
+    for c in range(a.shape[0]):
+        for d in range(b.shape[0]):
+            target[c, d] -= a[c, 0] * b[d, 0] + a[c, 1] * b[d, 1] + a[c, 2] * b[d, 2]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _invert(V, inverse):  # type: ignore[no-untyped-def]
+    """Of a symmetric matrix (3, 3), by cofactors."""
+    a, b, c, d, e, f = V[0, 0], V[0, 1], V[0, 2], V[1, 1], V[1, 2], V[2, 2]
+    A, B, C = d * f - e * e, c * e - b * f, b * e - c * d
+    determinant = a * A + b * B + c * C
+    inverse[0, 0], inverse[1, 1], inverse[2, 2] = (
+        A / determinant,
+        (a * f - c * c) / determinant,
+        (a * d - b * b) / determinant,
+    )
+    inverse[0, 1] = inverse[1, 0] = B / determinant
+    inverse[0, 2] = inverse[2, 0] = C / determinant
+    inverse[1, 2] = inverse[2, 1] = (b * c - a * e) / determinant
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _eliminate(residuals, by_pose, by_point, by_calibration, keyframe_index, starts, slots, damping, out):  # type: ignore[no-untyped-def]
+    """The sums of _WithoutPoints, point by point; ``slots`` (Q,) is in the order of :func:`_places`."""
+    blocks, U, S_pc, b_p, S_cc, b_c, V_inverse, gl, W, Wc = out
+    WV, WcV, V = np.empty((6, 3)), np.empty((len(b_c), 3)), np.empty((3, 3))
+    pair = 0
     for j in range(len(starts) - 1):
+        V[:] = 0.0
+        for m in range(starts[j], starts[j + 1]):
+            k, r = keyframe_index[m], residuals[m]
+            _add_products(V, by_point[m], by_point[m])
+            _add_products(U[k], by_pose[m], by_pose[m])
+            _add_products(W[m], by_pose[m], by_point[m])
+            _add_products(Wc[j], by_calibration[m], by_point[m])
+            _add_products(S_pc[k], by_pose[m], by_calibration[m])
+            _add_products(S_cc, by_calibration[m], by_calibration[m])
+            for c in range(3):
+                gl[j, c] += by_point[m, 0, c] * r[0] + by_point[m, 1, c] * r[1]
+            for c in range(6):
+                b_p[k, c] += by_pose[m, 0, c] * r[0] + by_pose[m, 1, c] * r[1]
+            for c in range(len(b_c)):
+                b_c[c] += by_calibration[m, 0, c] * r[0] + by_calibration[m, 1, c] * r[1]
+        for c in range(3):
+            V[c, c] += damping * V[c, c] + 1e-12
+        _invert(V, V_inverse[j])
+        _multiply(Wc[j], V_inverse[j], WcV)
+        _subtract_outer(S_cc, WcV, Wc[j])
+        for c in range(len(b_c)):
+            b_c[c] -= WcV[c, 0] * gl[j, 0] + WcV[c, 1] * gl[j, 1] + WcV[c, 2] * gl[j, 2]
         for a in range(starts[j], starts[j + 1]):
+            k = keyframe_index[a]
+            _multiply(W[a], V_inverse[j], WV)
+            _subtract_outer(S_pc[k], WV, Wc[j])
+            for c in range(6):
+                b_p[k, c] -= WV[c, 0] * gl[j, 0] + WV[c, 1] * gl[j, 1] + WV[c, 2] * gl[j, 2]
             for b in range(a, starts[j + 1]):
-                s = slots[n]
-                n += 1
-                k, q = keyframe_index[a], keyframe_index[b]
-                for c in range(6):
-                    for d in range(6):
-                        value = WV[a, c, 0] * W[b, d, 0] + WV[a, c, 1] * W[b, d, 1] + WV[a, c, 2] * W[b, d, 2]
-                        if k <= q:
-                            blocks[s, c, d] -= value
-                        if k > q or (k == q and a != b):  # the other order of the pair is this one transposed
-                            blocks[s, d, c] -= value
+                block, q = blocks[slots[pair]], keyframe_index[b]
+                pair += 1
+                if k <= q:
+                    _subtract_outer(block, WV, W[b])
+                if k > q or (k == q and a != b):  # the other order of the pair is this one transposed
+                    for c in range(6):
+                        for d in range(6):
+                            block[d, c] -= WV[c, 0] * W[b, d, 0] + WV[c, 1] * W[b, d, 1] + WV[c, 2] * W[b, d, 2]

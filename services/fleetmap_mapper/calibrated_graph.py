@@ -19,8 +19,8 @@ from gtsam.symbol_shorthand import X
 from numpy.typing import NDArray
 
 from fleetmap.camera import Camera
-from fleetmap.geometry import Pose
-from fleetmap_mapper.bordered_system import BorderedStep, LinearisedImages, LinearisedRest
+from fleetmap.geometry import Pose, nearest_rotations
+from fleetmap_mapper.bordered_system import BorderedStep, LinearisedImages, LinearisedRest, shared_blocks
 from fleetmap_mapper.calibration_parameters import CalibrationPrior, recorded_jacobian
 from fleetmap_mapper.global_adjustment import GlobalProblem, graph_without_images
 
@@ -80,6 +80,8 @@ class CalibratedGraph:
         self._graph, values = graph_without_images(problem)
         self.start = State(prior.change(problem.camera), values, problem.points_m)
         self._columns = _columns(self.keyframes, values)
+        k, starts = self.observations.keyframe_index, self.observations.starts
+        self._shared_blocks = shared_blocks(k, starts, self.keyframes)
         seen = np.isfinite(self._errors_px(self.start)).all(axis=1)
         self._weights = np.where(seen, 1.0 / self.observations.sigmas_px, 0.0)
 
@@ -90,7 +92,8 @@ class CalibratedGraph:
     def poses(self, state: State) -> list[Pose]:
         """The poses of a state."""
         rotations, centres = state.poses(self.keyframes)
-        return [Pose(R, t) for R, t in zip(rotations, centres, strict=True)]
+        # Every step multiplies rotations: without this, rounding errors pile up.
+        return [Pose(R, t) for R, t in zip(nearest_rotations(rotations), centres, strict=True)]
 
     def cost(self, state: State) -> float:
         """Half of all squares; infinite where something seen at the start has no pixel any more."""
@@ -124,6 +127,7 @@ class CalibratedGraph:
             self.observations.keyframe_index,
             self.observations.starts,
             self.keyframes,
+            self._shared_blocks,
         )
         return images, self._linearised_rest(state)
 

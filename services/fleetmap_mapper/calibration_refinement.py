@@ -19,7 +19,6 @@ Array = NDArray[np.float64]
 
 _MAX_STEPS = 50
 _MAX_DAMPING = 1e6
-_STOPPED = 1e-7  # relative decrease of the cost
 
 
 @dataclass(frozen=True)
@@ -31,17 +30,20 @@ class Refined:
     cost: float
 
 
-def refine_calibration(problem: GlobalProblem, prior: CalibrationPrior) -> Refined:
-    """Move the calibration with everything else to the optimum of all observations, fixes and priors."""
+def refine_calibration(problem: GlobalProblem, prior: CalibrationPrior, tolerance: float = 1e-7) -> Refined:
+    """Move the calibration with everything else to the optimum of all observations, fixes and priors.
+
+    It is reached when a step lessens the cost by less than ``tolerance`` of it.
+    """
     graph = CalibratedGraph(problem, prior)
-    state, cost = optimise(graph, _MAX_STEPS)
+    state, cost = optimise(graph, _MAX_STEPS, tolerance)
     refined = Refined(_renewed(problem, graph, state), graph.cost(graph.start), cost)
     if not prior.is_held:
         _log.info("calibration refined from %s to %s", problem.camera, refined.problem.camera)
     return refined
 
 
-def optimise(graph: CalibratedGraph, max_steps: int) -> tuple[State, float]:
+def optimise(graph: CalibratedGraph, max_steps: int, tolerance: float = 0.0) -> tuple[State, float]:
     """Levenberg-Marquardt from the graph's start: the state reached, and its cost."""
     state, damping = graph.start, 1e-5
     cost = graph.cost(state)
@@ -60,7 +62,7 @@ def optimise(graph: CalibratedGraph, max_steps: int) -> tuple[State, float]:
                 return state, cost
         decrease, state, cost = cost - new_cost, moved, new_cost
         damping = max(0.1 * damping, 1e-9)
-        if decrease < _STOPPED * cost:
+        if decrease <= tolerance * cost:
             break
     return state, cost
 

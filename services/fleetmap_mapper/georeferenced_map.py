@@ -26,6 +26,7 @@ from fleetmap_mapper.slam import PosedFrame
 
 Array = NDArray[np.float64]
 _ROUNDS = 2
+_TOLERANCE = 1e-5
 
 
 def adjust_with_fixes(
@@ -57,7 +58,7 @@ def adjust_with_fixes(
             np.radians(level_sigma_deg),
         )
         if placed.camera != recorded:
-            problem = refine_calibration(problem, calibration_prior(recorded, calibration)).problem
+            problem = refine_calibration(problem, calibration_prior(recorded, calibration), _TOLERANCE).problem
             placed = replace(placed, camera=problem.camera, pixels=problem.pixels)
         optimum = adjust_globally(problem)
         placed = without_outliers(replace(placed, poses=optimum.poses, points_m=optimum.points_m))

@@ -32,7 +32,7 @@ from fleetmap_mapper.subpixel import align_observations
 
 _log = logging.getLogger(__name__)
 
-_ROUNDS = 2
+_TOLERANCES = 1e-3, 1e-5  # of each round; the first only has to tell noise and outliers
 _NO_LEVEL_RAD = np.pi  # the direction of "down" is not asked for here
 
 
@@ -98,8 +98,8 @@ def _held(camera: Camera, settings: CalibrationGroup) -> CalibrationPrior:
 
 def _adjusted(placed: PlacedMap, prior: CalibrationPrior) -> PlacedMap:
     """Rounds of adjustment; after each, noise is estimated and outliers go."""
-    for _ in range(_ROUNDS):
-        optimum = refine_calibration(_problem(placed), prior).problem
+    for tolerance in _TOLERANCES:
+        optimum = refine_calibration(_problem(placed), prior, tolerance).problem
         placed = replace(
             placed,
             camera=optimum.camera,
