@@ -46,7 +46,8 @@ def align_observations(
     recorded = placed.camera.distort(placed.pixels)
     patches = _reference_patches(placed, octaves, recorded, reference, frames)
     warps = _warps(placed, octaves, recorded, reference)
-    refined, aligned = recorded.copy(), np.zeros(len(recorded), np.bool_)
+    refined = recorded.copy()
+    aligned: NDArray[np.bool_] = np.zeros(len(recorded), np.bool_)
     is_reference = np.zeros(len(recorded), np.bool_)
     is_reference[reference] = True
     recorded_sigmas_px = SCALE_FACTOR ** octaves.astype(np.float64)
@@ -64,12 +65,12 @@ def align_observations(
     followed = np.bincount(placed.point_index[aligned], minlength=len(placed.points_m)) > 0
     aligned[reference] = followed
     pixels = placed.camera.undistort(refined)
-    lost = ~np.isfinite(pixels).all(axis=1)
+    aligned &= np.isfinite(pixels).all(axis=1)
     return replace(
         placed,
-        pixels=np.where(lost[:, None], placed.pixels, pixels),
-        noise=np.where(aligned & ~lost, _ALIGNED_NOISE, 1.0),
-        is_aligned=aligned & ~lost,
+        pixels=np.where(aligned[:, None], pixels, placed.pixels),
+        noise=np.where(aligned, _ALIGNED_NOISE, 1.0),
+        is_aligned=aligned,
     )
 
 

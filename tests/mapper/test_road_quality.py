@@ -12,8 +12,8 @@ from fleetmap.geodesy import UtmAnchor
 from fleetmap.geometry import Sim3
 from fleetmap.road_quality import RoadQuality
 from fleetmap.trajectory import Trajectory
-from fleetmap_mapper.placed_map import PlacedMap
 from fleetmap_mapper.georeferencing import GnssTrack, PathPoint
+from fleetmap_mapper.placed_map import PlacedMap
 from fleetmap_mapper.road_quality import measure_road
 
 KEYFRAMES, STEP_M = 31, 2.0

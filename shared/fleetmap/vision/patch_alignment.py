@@ -152,7 +152,7 @@ def _prepare(patch, template, by_x, by_y):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _follow(level, warp, start, template, by_x, by_y, information, seen):  # type: ignore[no-untyped-def]
-    """Gauss-Newton on the patch's shift: its place in the level, and the correlation there; -1 where it is lost."""
+    """The patch shifted by Gauss-Newton: its place in the level and the correlation there, -1 where it is lost."""
     h11, h12, h22, squares = information
     determinant = h11 * h22 - h12 * h12
     x, y, correlation = start[0], start[1], -1.0
