@@ -23,6 +23,7 @@ from fleetmap_mapper.placed_map import PlacedMap, without_outliers
 from fleetmap_mapper.pose_covariances import position_covariances_m2
 from fleetmap_mapper.settings import CalibrationGroup
 from fleetmap_mapper.slam import PosedFrame
+from fleetmap_mapper.stage_times import StageTimes
 
 Array = NDArray[np.float64]
 _ROUNDS = 2
@@ -37,39 +38,58 @@ def adjust_with_fixes(
     level_sigma_deg: float,
     recorded: Camera,
     calibration: CalibrationGroup,
+    times: StageTimes,
     progress: Callable[[str, int, int], None],
 ) -> PlacedMap:
     """UGBA, twice: the second time without the first one's outliers and with the fixes carried anew.
 
-    Where the map is not made with the ``recorded`` calibration, its own moves on with everything else.
+    The bordered solver takes the map to its optimum; where it is not made with the ``recorded`` calibration, along
+    with its own. The whole graph in GTSAM has the last word.
     """
+    prior = calibration_prior(recorded, calibration)
+    prior = replace(prior, is_held=placed.camera == recorded)
     for done in range(_ROUNDS):
         progress("global adjustment", done, _ROUNDS)
-        frames = pose_frames(placed, growing, posed)
-        problem = GlobalProblem(
-            placed.camera,
-            placed.poses,
-            placed.points_m,
-            placed.keyframe_index,
-            placed.point_index,
-            placed.pixels,
-            observation_sigmas(placed),
-            carry_fixes(placed, posed, frames, track),
-            np.radians(level_sigma_deg),
+        problem = _joint_problem(placed, growing, posed, track, level_sigma_deg)
+        with times.stage("adjusting with fixes"):
+            problem = refine_calibration(problem, prior, _TOLERANCE).problem
+        if done == _ROUNDS - 1:
+            with times.stage("adjusting in GTSAM"):
+                optimum = adjust_globally(problem)
+            problem = replace(problem, poses=optimum.poses, points_m=optimum.points_m)
+        placed = without_outliers(
+            replace(
+                placed,
+                camera=problem.camera,
+                pixels=problem.pixels,
+                poses=list(problem.poses),
+                points_m=problem.points_m,
+            )
         )
-        if placed.camera != recorded:
-            problem = refine_calibration(problem, calibration_prior(recorded, calibration), _TOLERANCE).problem
-            placed = replace(placed, camera=problem.camera, pixels=problem.pixels)
-        optimum = adjust_globally(problem)
-        placed = without_outliers(replace(placed, poses=optimum.poses, points_m=optimum.points_m))
     before = np.array([k.vis_from_cam.translation_m for k in growing.keyframes])
     after = np.array([p.translation_m for p in placed.poses])
-    final = replace(problem, poses=optimum.poses, points_m=optimum.points_m)
     return replace(
         placed,
         map_from_vis=umeyama_alignment(before, after),
-        calibration=estimate_calibration(final, calibration, recorded),
-        position_covariances_m2=position_covariances_m2(final),
+        calibration=estimate_calibration(problem, calibration, recorded),
+        position_covariances_m2=position_covariances_m2(problem),
+    )
+
+
+def _joint_problem(
+    placed: PlacedMap, growing: GrowingMap, posed: Sequence[PosedFrame], track: GnssTrack, level_sigma_deg: float
+) -> GlobalProblem:
+    frames = pose_frames(placed, growing, posed)
+    return GlobalProblem(
+        placed.camera,
+        placed.poses,
+        placed.points_m,
+        placed.keyframe_index,
+        placed.point_index,
+        placed.pixels,
+        observation_sigmas(placed),
+        carry_fixes(placed, posed, frames, track),
+        np.radians(level_sigma_deg),
     )
 
 

@@ -67,9 +67,9 @@ def map_drive(
     segments = run_slam(_counted(drive, progress), drive.camera, settings, aligner, times, mask)
     _report_speed(sum(len(s.posed) for s in segments), time.perf_counter() - start_s, times)
 
-    calibration = None
+    calibration, times = None, StageTimes()
     if settings.gnss.mode != "mapping":
-        tightened = tighten(segments, drive.frames, settings.calibration, progress)
+        tightened = tighten(segments, drive.frames, settings.calibration, times, progress)
         segments, calibration = tightened.segments, tightened.calibration
     progress("placing the map", 0, 1)
     paths = [Timed.of(_stamps(s.posed), [p.vis_from_cam for p in s.posed]) for s in segments]
@@ -93,6 +93,7 @@ def map_drive(
             settings.gnss.level_sigma_deg,
             drive.camera,
             settings.calibration,
+            times,
             progress,
         )
     placed = replace(placed, map_from_vis=placed.map_from_vis @ joined.map_from_vis)
@@ -105,6 +106,7 @@ def map_drive(
     quality = with_screening(quality, screened)
     remarks = (*quality.remarks, *joined.remarks)
     quality = quality.model_copy(update={"segments": joined.count, "remarks": remarks})
+    _log.info("afterwards: %s", times)
     return MappedDrive(build_visual_map(placed, growing, track.anchor), trajectory, quality, road)
 
 

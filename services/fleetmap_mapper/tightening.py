@@ -28,6 +28,7 @@ from fleetmap_mapper.observation_noise import observation_sigmas, with_estimated
 from fleetmap_mapper.placed_map import PlacedMap, place, without_outliers
 from fleetmap_mapper.settings import CalibrationGroup
 from fleetmap_mapper.slam import PosedFrame, Segment
+from fleetmap_mapper.stage_times import StageTimes
 from fleetmap_mapper.subpixel import align_observations
 
 _log = logging.getLogger(__name__)
@@ -48,6 +49,7 @@ def tighten(
     segments: Sequence[Segment],
     frames: Callable[[], Iterator[Frame]],
     settings: CalibrationGroup,
+    times: StageTimes,
     progress: Callable[[str, int, int], None] = lambda *_: None,
 ) -> Tightened:
     """Bring segments to their visual optimum, all through one camera, the refined one if there is need.
@@ -61,12 +63,14 @@ def tighten(
     for done, number in enumerate(longest_first):
         progress("refining", done, len(segments))
         segment = segments[number]
-        aligned = _aligned(segment.growing, frames)
-        if done == 0:
-            placed = _adjusted_with_calibration(aligned, recorded, settings)
-            camera, estimate = placed.camera, placed.calibration
-        else:
-            placed = _adjusted(_through(aligned, camera), _held(camera, settings))
+        with times.stage("aligning patches"):
+            aligned = _aligned(segment.growing, frames)
+        with times.stage("adjusting images"):
+            if done == 0:
+                placed = _adjusted_with_calibration(aligned, recorded, settings)
+                camera, estimate = placed.camera, placed.calibration
+            else:
+                placed = _adjusted(_through(aligned, camera), _held(camera, settings))
         tight[number] = _written_back(placed, segment)
     return Tightened([tight[number] for number in range(len(segments))], estimate)
 
