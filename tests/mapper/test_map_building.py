@@ -33,14 +33,19 @@ def test_keyframes_are_images_of_the_trajectory(mapped):
 
 
 def test_every_landmark_projects_to_where_it_was_seen(mapped):
-    content = mapped.visual_map
+    content, every = mapped.visual_map, []
     for k in range(len(content.keyframes)):
         rows = content.observations.keyframe_index == k
         points = content.landmarks.points_m[content.observations.landmark_index[rows]]
         pixels = content.camera.project_ideal(content.keyframes.pose(k).inverse().transform(points))
         sigmas = 1.2 ** content.observations.octaves[rows].astype(np.float64)
         errors = np.linalg.norm(pixels - content.observations.pixels[rows], axis=1) / sigmas
-        assert errors.max() < 2.4477 + 1e-3  # 95 % of chi-square with two degrees of freedom
+        every.append(errors)
+    errors = np.concatenate(every)
+    assert 0.01 < np.median(errors) < 0.3  # aligned patches
+    within = 2.4477  # 95 % of chi-square with two degrees of freedom
+    assert np.percentile(errors, 99) < within
+    assert errors.max() < 1.5 * within  # corners that could not be aligned are less exact than one pixel
 
 
 def test_a_landmarks_descriptor_is_one_of_its_own_with_octave_and_distance(survey_drive, mapped):
@@ -54,11 +59,12 @@ def test_a_landmarks_descriptor_is_one_of_its_own_with_octave_and_distance(surve
         features = extractor.extract(survey_drive.images[index_of[int(content.keyframes.stamps_ns[k])]].image)
         rows = np.flatnonzero(observations.keyframe_index == k)
         places = cKDTree(np.column_stack([features.pixels, 10.0 * features.octaves]))
-        _, feature = places.query(np.column_stack([observations.pixels[rows], 10.0 * observations.octaves[rows]]))
+        seen = np.column_stack([observations.pixels[rows], 10.0 * observations.octaves[rows]])
+        _, near = places.query(seen, k=4)  # aligned by a pixel or so, a corner may have come closer to another one
         ids = observations.landmark_index[rows]
         away = np.linalg.norm(landmarks.points_m[ids] - content.keyframes.positions_m[k], axis=1)
         found[ids] |= (
-            (features.descriptors[feature] == landmarks.descriptors[ids]).all(axis=1)
+            (features.descriptors[near] == landmarks.descriptors[ids][:, None]).all(axis=2).any(axis=1)
             & (observations.octaves[rows] == landmarks.octaves[ids])
             & (np.abs(away - landmarks.distances_m[ids]) < 1e-2)
         )
