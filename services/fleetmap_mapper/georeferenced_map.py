@@ -50,7 +50,8 @@ def adjust_with_fixes(
     prior = replace(prior, is_held=placed.camera == recorded)
     for done in range(_ROUNDS):
         progress("global adjustment", done, _ROUNDS)
-        problem = _joint_problem(placed, growing, posed, track, level_sigma_deg)
+        fixes = carry_fixes(placed, posed, pose_frames(placed, growing, posed), track)
+        problem = problem_of(placed, fixes, np.radians(level_sigma_deg))
         with times.stage("adjusting with fixes"):
             problem = refine_calibration(problem, prior, _TOLERANCE).problem
         if done == _ROUNDS - 1:
@@ -76,10 +77,8 @@ def adjust_with_fixes(
     )
 
 
-def _joint_problem(
-    placed: PlacedMap, growing: GrowingMap, posed: Sequence[PosedFrame], track: GnssTrack, level_sigma_deg: float
-) -> GlobalProblem:
-    frames = pose_frames(placed, growing, posed)
+def problem_of(placed: PlacedMap, fixes: Sequence[FixTerm] = (), level_sigma_rad: float = np.pi) -> GlobalProblem:
+    """All that is to be adjusted; without fixes and with no idea of "down", a matter of images alone."""
     return GlobalProblem(
         placed.camera,
         placed.poses,
@@ -88,8 +87,8 @@ def _joint_problem(
         placed.point_index,
         placed.pixels,
         observation_sigmas(placed),
-        carry_fixes(placed, posed, frames, track),
-        np.radians(level_sigma_deg),
+        fixes,
+        level_sigma_rad,
     )
 
 

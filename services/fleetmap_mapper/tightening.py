@@ -21,10 +21,9 @@ from fleetmap.geometry import Pose, Sim3
 from fleetmap_mapper.calibration_check import CalibrationEstimate, estimate_calibration, is_contradicted
 from fleetmap_mapper.calibration_parameters import CalibrationPrior, calibration_prior
 from fleetmap_mapper.calibration_refinement import refine_calibration, seen_anew
-from fleetmap_mapper.georeferenced_map import pose_frames
-from fleetmap_mapper.global_adjustment import GlobalProblem
+from fleetmap_mapper.georeferenced_map import pose_frames, problem_of
 from fleetmap_mapper.growing_map import GrowingMap
-from fleetmap_mapper.observation_noise import observation_sigmas, with_estimated_noise
+from fleetmap_mapper.observation_noise import with_estimated_noise
 from fleetmap_mapper.placed_map import PlacedMap, place, without_outliers
 from fleetmap_mapper.settings import CalibrationGroup
 from fleetmap_mapper.slam import PosedFrame, Segment
@@ -34,7 +33,6 @@ from fleetmap_mapper.subpixel import align_observations
 _log = logging.getLogger(__name__)
 
 _TOLERANCES = 1e-3, 1e-5  # of each round; the first only has to tell noise and outliers
-_NO_LEVEL_RAD = np.pi  # the direction of "down" is not asked for here
 
 
 @dataclass(frozen=True)
@@ -89,7 +87,7 @@ def _adjusted_with_calibration(placed: PlacedMap, recorded: Camera, settings: Ca
     if settings.mode == "recorded":
         return _adjusted(placed, _held(recorded, settings))
     refined = _adjusted(placed, calibration_prior(recorded, settings))
-    estimate = estimate_calibration(_problem(refined), settings, recorded)
+    estimate = estimate_calibration(problem_of(refined), settings, recorded)
     if settings.mode == "refined" or is_contradicted(estimate, settings):
         return replace(refined, calibration=estimate)
     held = _adjusted(_through(refined, recorded), _held(recorded, settings))
@@ -103,7 +101,7 @@ def _held(camera: Camera, settings: CalibrationGroup) -> CalibrationPrior:
 def _adjusted(placed: PlacedMap, prior: CalibrationPrior) -> PlacedMap:
     """Rounds of adjustment; after each, noise is estimated and outliers go."""
     for tolerance in _TOLERANCES:
-        optimum = refine_calibration(_problem(placed), prior, tolerance).problem
+        optimum = refine_calibration(problem_of(placed), prior, tolerance).problem
         placed = replace(
             placed,
             camera=optimum.camera,
@@ -113,20 +111,6 @@ def _adjusted(placed: PlacedMap, prior: CalibrationPrior) -> PlacedMap:
         )
         placed = without_outliers(with_estimated_noise(placed))
     return placed
-
-
-def _problem(placed: PlacedMap) -> GlobalProblem:
-    return GlobalProblem(
-        placed.camera,
-        placed.poses,
-        placed.points_m,
-        placed.keyframe_index,
-        placed.point_index,
-        placed.pixels,
-        observation_sigmas(placed),
-        [],
-        _NO_LEVEL_RAD,
-    )
 
 
 def _through(placed: PlacedMap, camera: Camera) -> PlacedMap:
