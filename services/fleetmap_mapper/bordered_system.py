@@ -70,7 +70,6 @@ class _WithoutPoints:
     gl: Array  # (P, 3)
     W: Array  # (M, 6, 3) pose by point
     Wc: Array  # (P, C, 3) calibration by point
-    point_index: IntArray  # (M,)
 
 
 def solve_bordered(images: LinearisedImages, rest: LinearisedRest, change: Array, damping: float) -> BorderedStep:
@@ -87,8 +86,8 @@ def solve_bordered(images: LinearisedImages, rest: LinearisedRest, change: Array
     information = reduced.S_cc + np.eye(len(change)) + S_pc.T @ poses_follow
     dc = np.linalg.solve(information, -(reduced.b_c + change + S_pc.T @ alone)).astype(np.float64)
     dp = alone + poses_follow @ dc
-    of_poses = _by_observation(np.column_stack([poses_follow, dp]), images)  # (M, 6, C + 1)
-    carried = sum_rows(_products(reduced.W, of_poses), reduced.point_index, len(reduced.gl))
+    of_poses = np.column_stack([poses_follow, dp])[: 6 * images.keyframes].reshape(images.keyframes, 6, -1)
+    carried = _carried(reduced.W, np.ascontiguousarray(of_poses), images.keyframe_index, images.starts)
     points_follow = -reduced.V_inverse @ (reduced.Wc.transpose(0, 2, 1) + carried[:, :, :-1])
     dl = -reduced.V_inverse @ (reduced.gl + reduced.Wc.transpose(0, 2, 1) @ dc + carried[:, :, -1])[:, :, None]
     return BorderedStep(dc, dp, dl[:, :, 0], information, poses_follow, points_follow)
@@ -113,33 +112,14 @@ def _eliminate_points(images: LinearisedImages, damping: float) -> _WithoutPoint
         damping,
         (blocks, U, S_pc, b_p, S_cc, b_c, V_inverse, gl, W, Wc),
     )
-    point_index = np.repeat(np.arange(P), np.diff(images.starts))
     S_pp = _pose_system(blocks, U, places)
-    return _WithoutPoints(S_pp, S_pc.reshape(6 * K, C), b_p.ravel(), S_cc, b_c, V_inverse, gl, W, Wc, point_index)
-
-
-def _products(a: Array, b: Array) -> Array:
-    """a^T b of every row: (M, i, j) from (M, n, i) and (M, n, j)."""
-    return np.asarray(a.transpose(0, 2, 1) @ b)
-
-
-def _by_observation(of_poses: Array, images: LinearisedImages) -> Array:
-    """Rows (N, C) of the poses' tangents as (M, 6, C), those of each observation's keyframe."""
-    per_keyframe = of_poses[: 6 * images.keyframes].reshape(images.keyframes, 6, -1)
-    return np.asarray(per_keyframe[images.keyframe_index])
+    return _WithoutPoints(S_pp, S_pc.reshape(6 * K, C), b_p.ravel(), S_cc, b_c, V_inverse, gl, W, Wc)
 
 
 def _lengthened(of_poses: Array, rest: LinearisedRest) -> Array:
     """With zeros for the variables after the poses."""
     more = rest.jacobian.shape[1] - len(of_poses)
     return np.concatenate([of_poses, np.zeros((more, *of_poses.shape[1:]))])
-
-
-def sum_rows(values: Array, index: IntArray, count: int) -> Array:
-    """Sums (count, ...) of the rows of ``values`` (M, ...) by their index."""
-    flat = values.reshape(len(values), -1)
-    picker = sp.csr_matrix((np.ones(len(index)), (index, np.arange(len(index)))), shape=(count, len(index)))
-    return np.asarray(picker @ flat).reshape(count, *values.shape[1:])
 
 
 def shared_blocks(keyframe_index: IntArray, starts: IntArray, keyframes: int) -> tuple[IntArray, IntArray]:
@@ -173,6 +153,21 @@ def _enlarged(matrix: sp.csc_matrix, side: int) -> sp.csc_matrix:
 
 def _padded(indptr: NDArray[np.int32], length: int) -> NDArray[np.int32]:
     return np.concatenate([indptr, np.full(length - len(indptr), indptr[-1], indptr.dtype)])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _carried(W, of_poses, keyframe_index, starts):  # type: ignore[no-untyped-def]
+    """Sum over each point's observations of W^T times the rows (6, C + 1) of its keyframe: (P, 3, C + 1)."""
+    columns = of_poses.shape[2]
+    carried = np.zeros((len(starts) - 1, 3, columns))
+    for j in range(len(starts) - 1):
+        for m in range(starts[j], starts[j + 1]):
+            follow = of_poses[keyframe_index[m]]
+            for c in range(3):
+                for d in range(6):
+                    for e in range(columns):
+                        carried[j, c, e] += W[m, d, c] * follow[d, e]
+    return carried
 
 
 @njit(cache=True, nogil=True)

@@ -12,6 +12,7 @@ import logging
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
+import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from fleetmap.camera import Camera
@@ -22,7 +23,6 @@ from fleetmap_mapper.bordered_system import (
     LinearisedImages,
     LinearisedRest,
     solve_bordered,
-    sum_rows,
 )
 from fleetmap_mapper.calibrated_graph import CalibratedGraph
 from fleetmap_mapper.calibration_parameters import (
@@ -39,6 +39,7 @@ from fleetmap_mapper.settings import CalibrationGroup
 
 _log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 
 _STEPS = 4
 _DAMPING = 1e-8  # the free directions of a map without fixes say nothing about the calibration
@@ -181,13 +182,20 @@ def _covariance(images: LinearisedImages, rest: LinearisedRest, step: BorderedSt
     scores = (images.residuals[:, None, :] @ rows)[:, 0] * left[point_index][:, None]
     stretch = max(1, -(-images.keyframes // _CLUSTERS))
     clusters = k[images.starts[:-1]] // stretch if len(counts) else np.zeros(0, np.int64)
-    by_cluster = sum_rows(scores, clusters[point_index], int(clusters.max(initial=0)) + 1)
+    by_cluster = _sum_rows(scores, clusters[point_index], int(clusters.max(initial=0)) + 1)
     by_rest = rest.jacobian @ step.poses_by_calibration
     own = np.asarray(np.linalg.inv(step.information), dtype=np.float64)
     meat = by_cluster.T @ by_cluster + by_rest.T @ by_rest + np.eye(len(own))
     sandwich = own @ meat @ own
     sandwich *= len(by_cluster) / max(len(by_cluster) - 1, 1)
     return _larger(own, sandwich)
+
+
+def _sum_rows(values: Array, index: IntArray, count: int) -> Array:
+    """Sums (count, ...) of the rows of ``values`` (M, ...) by their index."""
+    flat = values.reshape(len(values), -1)
+    picker = sp.csr_matrix((np.ones(len(index)), (index, np.arange(len(index)))), shape=(count, len(index)))
+    return np.asarray(picker @ flat).reshape(count, *values.shape[1:])
 
 
 def _larger(a: Array, b: Array) -> Array:
