@@ -25,7 +25,6 @@ from fleetmap_mapper.georeferencing import GnssTrack, gnss_track, path_at_fixes
 from fleetmap_mapper.image_mask import ImageMask
 from fleetmap_mapper.map_building import build_visual_map
 from fleetmap_mapper.placed_map import place, without_outliers
-from fleetmap_mapper.plausible_motion import implausible_images
 from fleetmap_mapper.quality import assess
 from fleetmap_mapper.road_quality import measure_road
 from fleetmap_mapper.segment_joining import place_segments
@@ -100,30 +99,15 @@ def map_drive(
     placed = replace(placed, map_from_vis=placed.map_from_vis @ joined.map_from_vis)
 
     frames = pose_frames(placed, growing, posed)
-    posed, frames, left_out = _without_jumps(posed, frames)
     trajectory = _trajectory(posed, frames, track)
     path = path_at_fixes(_stamps(posed), frames, track)
     road = measure_road(placed, trajectory, path, track, settings.quality.weak_gap_s)
     quality = assess(placed, road, len(trajectory), drive.frame_count, track.anchor, settings)
     quality = with_screening(quality, screened)
-    remarks = (*quality.remarks, *joined.remarks, *left_out)
+    remarks = (*quality.remarks, *joined.remarks)
     quality = quality.model_copy(update={"segments": joined.count, "remarks": remarks})
     _log.info("afterwards: %s", times)
     return MappedDrive(build_visual_map(placed, growing, track.anchor), trajectory, quality, road)
-
-
-def _without_jumps(
-    posed: list[PosedFrame], frames: list[Pose]
-) -> tuple[list[PosedFrame], list[Pose], tuple[str, ...]]:
-    """The images that a vehicle can have taken one after the other, their poses, and a remark about the others."""
-    may_go = np.array([p.frame_index != p.keyframe.frame_index for p in posed], dtype=np.bool_)
-    positions_m = np.array([f.translation_m for f in frames]).reshape(-1, 3)
-    jumps = implausible_images(_stamps(posed), positions_m, may_go)
-    if not jumps.any():
-        return posed, frames, ()
-    kept = np.flatnonzero(~jumps)
-    remark = f"{np.count_nonzero(jumps)} images are left without a pose: no vehicle moves as theirs would have it"
-    return [posed[i] for i in kept], [frames[i] for i in kept], (remark,)
 
 
 def _counted(drive: Drive, progress: Progress) -> Iterator[Frame]:
