@@ -171,7 +171,7 @@ def test_spoilt_images_are_posed_rightly_or_not_at_all(survey, survey_drive, spo
     errors = survey.errors_m(result.trajectory)
     is_clear = np.isin(result.trajectory.stamps_ns, clear)
     assert 0.005 < errors[is_clear].mean() < 0.15
-    assert errors[is_clear].max() < 0.5
+    assert errors[is_clear].max() < 0.3
     assert errors.max() < 1.0
 
 
