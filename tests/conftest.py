@@ -28,8 +28,10 @@ from fleetmap_cli.main import main
 
 FLEETMAP = [sys.executable, "-c", "from fleetmap_cli.main import main; main()"]
 
-# A shell lets its background jobs ignore Ctrl-C, and children inherit that: the tests of it would test nothing.
+# A shell lets its background jobs ignore Ctrl-C, and nohup the end of its terminal; children inherit that, and the
+# tests of both would test nothing.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 @pytest.fixture(scope="session")
