@@ -11,20 +11,14 @@ from fleetmap.geodesy import UtmAnchor
 from fleetmap.vision.matching import medoid_descriptor
 from fleetmap.visual_map import Keyframes, Landmarks, Observations, VisualMap
 from fleetmap_mapper.growing_map import GrowingMap
-from fleetmap_mapper.placed_map import PlacedMap
+from fleetmap_mapper.placed_map import PlacedMap, octaves_of
 
 Array = NDArray[np.float64]
 
 
 def build_visual_map(placed: PlacedMap, growing: GrowingMap, anchor: UtmAnchor) -> VisualMap:
     """The finished map."""
-    octaves = np.array(
-        [
-            growing.keyframes[k].features.octaves[f]
-            for k, f in zip(placed.keyframe_index, placed.feature_index, strict=True)
-        ],
-        dtype=np.uint8,
-    )
+    octaves = octaves_of(placed, growing)
     return VisualMap(
         anchor,
         placed.map_from_vis,

@@ -44,6 +44,10 @@ class PlacedMap:
         """Sigma of each observation (M,)."""
         return self.corner_sigmas_px * self.noise
 
+    def observations_of(self, keyframe: int) -> slice:
+        """Where the observations of one keyframe stand."""
+        return slice(*np.searchsorted(self.keyframe_index, [keyframe, keyframe + 1]).tolist())
+
 
 def place(growing: GrowingMap, map_from_vis: Sim3) -> PlacedMap:
     """The growing map as it stands, moved by S; landmarks seen once, or all but infinitely far, stay behind."""
@@ -61,7 +65,8 @@ def place(growing: GrowingMap, map_from_vis: Sim3) -> PlacedMap:
     often = np.bincount(seen, minlength=growing.landmark_count)[seen] >= _MIN_OBSERVATIONS
     seen, index, feature = seen[often], index[often], feature[often]
     ids, point_index = np.unique(seen, return_inverse=True)
-    own = [(k, feature[index == k.index]) for k in growing.keyframes]
+    starts = np.searchsorted(index, np.arange(1, len(growing.keyframes)))
+    own = list(zip(growing.keyframes, np.split(feature, starts), strict=True))
     pixels = np.concatenate([k.features.pixels[rows] for k, rows in own])
     return PlacedMap(
         growing.camera,
@@ -78,6 +83,13 @@ def place(growing: GrowingMap, map_from_vis: Sim3) -> PlacedMap:
         np.concatenate([k.noise[rows] for k, rows in own]),
         np.concatenate([k.is_aligned[rows] for k, rows in own]),
         growing.track_correlation,
+    )
+
+
+def octaves_of(placed: PlacedMap, growing: GrowingMap) -> NDArray[np.uint8]:
+    """The pyramid level that each observation (M,) was found on."""
+    return np.concatenate(
+        [k.features.octaves[placed.feature_index[placed.observations_of(k.index)]] for k in growing.keyframes]
     )
 
 

@@ -52,7 +52,8 @@ def align_observations(
     is_reference[reference] = True
     recorded_sigmas_px = SCALE_FACTOR ** octaves.astype(np.float64)
     for keyframe, pyramid in _keyframe_pyramids(placed, frames):
-        rows = np.flatnonzero((placed.keyframe_index == keyframe) & ~is_reference)
+        own = placed.observations_of(keyframe)
+        rows = own.start + np.flatnonzero(~is_reference[own])
         refined[rows], aligned[rows] = align_patches(
             pyramid,
             SCALE_FACTOR,

@@ -8,12 +8,10 @@ a few pixels at the image border is what most of the drift of monocular scale co
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap.camera import Camera
 from fleetmap.drive import Frame
@@ -22,15 +20,13 @@ from fleetmap_mapper.calibration_check import CalibrationEstimate, estimate_cali
 from fleetmap_mapper.calibration_parameters import CalibrationPrior, calibration_prior
 from fleetmap_mapper.calibration_refinement import refine_calibration, seen_anew
 from fleetmap_mapper.georeferenced_map import pose_frames, problem_of
-from fleetmap_mapper.growing_map import GrowingMap
+from fleetmap_mapper.growing_map import GrowingMap, Keyframe
 from fleetmap_mapper.observation_noise import with_estimated_noise
-from fleetmap_mapper.placed_map import PlacedMap, place, without_outliers
+from fleetmap_mapper.placed_map import PlacedMap, octaves_of, place, without_outliers
 from fleetmap_mapper.settings import CalibrationGroup
 from fleetmap_mapper.slam import PosedFrame, Segment
 from fleetmap_mapper.stage_times import StageTimes
 from fleetmap_mapper.subpixel import align_observations
-
-_log = logging.getLogger(__name__)
 
 _TOLERANCES = 1e-3, 1e-5  # of each round; the first only has to tell noise and outliers
 
@@ -62,7 +58,8 @@ def tighten(
         progress("refining", done, len(segments))
         segment = segments[number]
         with times.stage("aligning patches"):
-            aligned = _aligned(segment.growing, frames)
+            placed = place(segment.growing, Sim3.identity())
+            aligned = align_observations(placed, octaves_of(placed, segment.growing), frames)
         with times.stage("adjusting images"):
             if done == 0:
                 placed = _adjusted_with_calibration(aligned, recorded, settings)
@@ -71,15 +68,6 @@ def tighten(
                 placed = _adjusted(_through(aligned, camera), _held(camera, settings))
         tight[number] = _written_back(placed, segment)
     return Tightened([tight[number] for number in range(len(segments))], estimate)
-
-
-def _aligned(growing: GrowingMap, frames: Callable[[], Iterator[Frame]]) -> PlacedMap:
-    placed = place(growing, Sim3.identity())
-    octaves = np.empty(len(placed.pixels), np.uint8)
-    for keyframe in growing.keyframes:
-        rows = placed.keyframe_index == keyframe.index
-        octaves[rows] = keyframe.features.octaves[placed.feature_index[rows]]
-    return align_observations(placed, octaves, frames)
 
 
 def _adjusted_with_calibration(placed: PlacedMap, recorded: Camera, settings: CalibrationGroup) -> PlacedMap:
@@ -126,8 +114,7 @@ def _written_back(placed: PlacedMap, segment: Segment) -> Segment:
     growing.points[placed.landmark_ids] = placed.points_m
     for keyframe, pose in zip(growing.keyframes, placed.poses, strict=True):
         keyframe.vis_from_cam = pose
-        rows = placed.keyframe_index == keyframe.index
-        _renew_observations(growing, keyframe.index, placed, rows, before)
+        _renew_observations(growing, keyframe, placed, before)
     dead = np.setdiff1d(growing.landmarks_of(growing.keyframes), placed.landmark_ids).astype(np.int32)
     growing.kill(dead)
     growing.refresh(placed.landmark_ids, growing.keyframes)
@@ -138,10 +125,9 @@ def _written_back(placed: PlacedMap, segment: Segment) -> Segment:
     return Segment(growing, posed)
 
 
-def _renew_observations(
-    growing: GrowingMap, index: int, placed: PlacedMap, rows: NDArray[np.bool_], before: Camera
-) -> None:
-    keyframe, features = growing.keyframes[index], placed.feature_index[rows]
+def _renew_observations(growing: GrowingMap, keyframe: Keyframe, placed: PlacedMap, before: Camera) -> None:
+    rows = placed.observations_of(keyframe.index)
+    features = placed.feature_index[rows]
     pixels = seen_anew(keyframe.features.pixels, before, placed.camera)
     pixels[features] = placed.pixels[rows]
     keyframe.features = replace(keyframe.features, pixels=pixels)
