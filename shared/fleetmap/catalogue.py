@@ -1,12 +1,15 @@
 """What the map server and its clients say to each other about maps.
 
 A map is known by its ``map_id``; each content it ever had is a version, named by the SHA-256 of its
-manifest. The latest version of an id is the one published last.
+manifest. Publishing, and going back to an older content, adds the next number to the map's history; the latest
+version is the one with the highest number. A retired version is neither listed nor served any more.
 """
 
 from __future__ import annotations
 
-from typing import Self
+from collections.abc import Sequence
+from itertools import accumulate, pairwise
+from typing import Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +46,26 @@ class MapEntry(BaseModel):
     reprojection_rms_px: float
     warnings: tuple[str, ...] = ()
 
+    number: int = Field(default=1, ge=1)  # in the map's history
+    predecessor: Sha256 | None = None  # the version before it that is not retired
+    predecessor_number: int | None = None
+    successor: Sha256 | None = None  # the version after it
+    successor_number: int | None = None
+    is_latest: bool = True
+    retired: bool = False
+    origin: Literal["published", "rollback"] = "published"
+
+    drive: str = ""  # name of the recording
+    drive_sha256: Sha256 | None = None
+    frames_total: int | None = None
+    frames_posed: int | None = None
+    segments: int = 1  # see fleetmap.manifest.Quality for this and what follows
+    position_sigma_m: float | None = None
+    position_sigma_p95_m: float | None = None
+    height_sigma_m: float | None = None
+    landmarks_per_m: float | None = None
+    weak_length_m: float | None = None
+
     @classmethod
     def from_manifest(cls, manifest: Manifest, version: str, manifest_bytes: int, published_ns: int) -> Self:
         """What the catalogue keeps of a manifest; ``manifest_bytes`` is the length of its file."""
@@ -67,28 +90,22 @@ class MapEntry(BaseModel):
             gnss_residual_rms_m=quality.gnss_residual_rms_m,
             reprojection_rms_px=quality.reprojection_rms_px,
             warnings=quality.warnings,
+            drive=manifest.provenance.drive,
+            drive_sha256=manifest.provenance.drive_sha256,
+            frames_total=quality.frames_total,
+            frames_posed=quality.frames_posed,
+            segments=quality.segments,
+            position_sigma_m=quality.position_sigma_m,
+            position_sigma_p95_m=quality.position_sigma_p95_m,
+            height_sigma_m=quality.height_sigma_m,
+            landmarks_per_m=quality.landmarks_per_m,
+            weak_length_m=quality.weak_length_m,
         )
 
     def distance_m(self, lat_deg: float, lon_deg: float) -> float:
         """Ground distance from a place to the map's trajectory (to its bounding box if it has none)."""
-        nearest_lonlat = _nearest_on_path(self._outline(), lat_deg, lon_deg)
-        _, _, distance_m = Geod(ellps="WGS84").inv(lon_deg, lat_deg, *nearest_lonlat)
-        return float(distance_m)
-
-    def _outline(self) -> NDArray[np.float64]:
-        """The trajectory, or the corners of the bounding box; (N, 2) longitude, latitude."""
-        west, south, east, north = self.bbox_lonlat
-        corners = ((west, south), (east, south), (east, north), (west, north), (west, south))
-        return np.array(self.trajectory_lonlat or corners, dtype=np.float64)
-
-
-class MapPage(BaseModel):
-    """A page of the catalogue; ``next_offset`` asks for the page after it, None at the end."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore")
-
-    maps: tuple[MapEntry, ...]
-    next_offset: int | None = None
+        path = np.array(self.trajectory_lonlat or box_corners(self.bbox_lonlat), dtype=np.float64)
+        return float(distances_m([path], lat_deg, lon_deg)[0])
 
 
 def search_box_lonlat(lat_deg: float, lon_deg: float, radius_m: float) -> tuple[float, float, float, float]:
@@ -102,19 +119,63 @@ def search_box_lonlat(lat_deg: float, lon_deg: float, radius_m: float) -> tuple[
     return (west, max(lat_deg - reach_lat_deg, -90.0), east, min(lat_deg + reach_lat_deg, 90.0))
 
 
-def _nearest_on_path(path_lonlat: NDArray[np.float64], lat_deg: float, lon_deg: float) -> tuple[float, float]:
-    """The point of a polyline nearest to a place, found on the plane that touches the Earth at the place."""
+def box_corners(box: tuple[float, float, float, float]) -> tuple[tuple[float, float], ...]:
+    """The closed outline of a box (west, south, east, north); longitude, latitude."""
+    west, south, east, north = box
+    return ((west, south), (east, south), (east, north), (west, north), (west, south))
+
+
+def distances_m(
+    paths_lonlat: Sequence[NDArray[np.float64]], lat_deg: float, lon_deg: float
+) -> NDArray[np.float64]:
+    """Ground distances from a place to polylines.
+
+    The nearest point of each is found on the plane that touches the Earth at the place. What a path's distance
+    is does not depend on the others, to the last bit.
+
+    Args:
+        paths_lonlat: (N, 2) each, N >= 1: longitude, latitude in degrees.
+        lat_deg: of the place.
+        lon_deg: of the place.
+
+    Returns:
+        As many as there are paths.
+    """
+    if not paths_lonlat:
+        return np.empty(0)
     shrink = max(float(np.cos(np.radians(lat_deg))), 1e-9)
-    offsets = path_lonlat - (lon_deg, lat_deg)
-    offsets[:, 0] = (offsets[:, 0] + 180.0) % 360.0 - 180.0
-    plane = offsets * (shrink, 1.0)  # (N, 2) degrees of latitude
-    starts, ends = (plane[:-1], plane[1:]) if len(plane) > 1 else (plane, plane)
+    feet, path_starts = _nearest_of_segments(paths_lonlat, lat_deg, lon_deg, shrink)
+    distances_sq = feet[:, 0] * feet[:, 0] + feet[:, 1] * feet[:, 1]
+    ends = pairwise([*path_starts, len(distances_sq)])
+    nearest = [begin + int(np.argmin(distances_sq[begin:end])) for begin, end in ends]
+    east, north = feet[nearest].T
+    here = np.ones_like(east)
+    lons = (lon_deg + east / shrink + 180.0) % 360.0 - 180.0
+    _, _, distances = Geod(ellps="WGS84").inv(lon_deg * here, lat_deg * here, lons, lat_deg + north)
+    return np.asarray(distances, dtype=np.float64)
+
+
+def _nearest_of_segments(
+    paths: Sequence[NDArray[np.float64]], lat_deg: float, lon_deg: float, shrink: float
+) -> tuple[NDArray[np.float64], list[int]]:
+    """The nearest points of all segments, (S, 2) degrees of latitude east and north of the place; and the first
+    segment of each path. A path of one position is one segment without length."""
+    segments = [(path[:-1], path[1:]) if len(path) > 1 else (path, path) for path in paths]
+    starts, ends = (
+        _on_plane(np.concatenate(side), lat_deg, lon_deg, shrink) for side in zip(*segments, strict=True)
+    )
     steps = ends - starts
-    lengths_sq = np.maximum(np.einsum("ij,ij->i", steps, steps), 1e-30)
-    along = np.clip(-np.einsum("ij,ij->i", starts, steps) / lengths_sq, 0.0, 1.0)
-    feet = starts + along[:, None] * steps
-    east, north = feet[np.argmin(np.einsum("ij,ij->i", feet, feet))]
-    return (_wrap_lon(lon_deg + float(east) / shrink), lat_deg + float(north))
+    lengths_sq = np.maximum(steps[:, 0] * steps[:, 0] + steps[:, 1] * steps[:, 1], 1e-30)
+    along = np.clip(-(starts[:, 0] * steps[:, 0] + starts[:, 1] * steps[:, 1]) / lengths_sq, 0.0, 1.0)
+    lengths = [len(begin) for begin, _ in segments]
+    return starts + along[:, None] * steps, [0, *accumulate(lengths[:-1])]
+
+
+def _on_plane(lonlat: NDArray[np.float64], lat_deg: float, lon_deg: float, shrink: float) -> NDArray[np.float64]:
+    """Degrees of latitude east and north of a place."""
+    offsets = lonlat - (lon_deg, lat_deg)
+    offsets[:, 0] = (offsets[:, 0] + 180.0) % 360.0 - 180.0
+    return offsets * (shrink, 1.0)
 
 
 def _wrap_lon(lon_deg: float) -> float:

@@ -10,9 +10,12 @@ FleetmapError
 └── RunError                  failed while running                        exit code 1
     ├── NoPoseError           not one frame of the whole drive could be localised
     ├── StorageError          the disk is full or refuses
+    ├── ConflictError         somebody else was first: another version of the map is the latest by now
+    ├── JobLostError          a job belongs to another worker by now, or to none
     └── ServerError           what goes wrong between client and map server
         ├── ServerUnreachableError
         ├── ServerRefusedError    the server answered with a problem document
+        │   └── AccessDeniedError     it wants a token, or another one
         └── TransferError         the transfer ended before everything had arrived
 """
 
@@ -63,6 +66,14 @@ class StorageError(RunError):
     """The disk is full or refuses to be written."""
 
 
+class ConflictError(RunError):
+    """Somebody else was first: another version of the map is the latest by now."""
+
+
+class JobLostError(RunError):
+    """A job belongs to another worker by now, or to none; what its fence protects was not done."""
+
+
 class ServerError(RunError):
     """Something went wrong between a client and the map server."""
 
@@ -73,6 +84,10 @@ class ServerUnreachableError(ServerError):
 
 class ServerRefusedError(ServerError):
     """The map server answered with a problem document (RFC 9457)."""
+
+
+class AccessDeniedError(ServerRefusedError):
+    """The map server wants a token, or one that may do more."""
 
 
 class TransferError(ServerError):

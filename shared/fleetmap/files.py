@@ -46,6 +46,15 @@ def write_text_atomically(target: Path, text: str) -> None:
     write_bytes_atomically(target, text.encode())
 
 
+def flush_folder(folder: Path) -> None:
+    """Have the disk keep which names are in a folder. Raises OSError."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
 def refuse_existing(target: Path, force: bool) -> None:
     """Raise OutputExistsError if ``target`` is there already and ``force`` is not given."""
     if target.exists() and not force:

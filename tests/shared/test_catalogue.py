@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from pyproj import Geod
 
-from fleetmap.catalogue import MapEntry, search_box_lonlat
+from fleetmap.catalogue import MapEntry, distances_m, search_box_lonlat
 
 GEOD = Geod(ellps="WGS84")
 
@@ -80,3 +81,29 @@ def test_a_search_box_over_a_pole_takes_all_longitudes():
 def test_entries_survive_their_journey_as_json():
     street = entry((8.4, 49.0), (8.5, 49.1))
     assert MapEntry.model_validate_json(street.model_dump_json()) == street
+
+
+def test_an_entry_of_an_older_server_has_no_history():
+    street = entry((8.4, 49.0), (8.5, 49.1))
+    written_before = set(MapEntry.model_fields) - {
+        name for name, field in MapEntry.model_fields.items() if not field.is_required() and name != "warnings"
+    }
+    old = MapEntry.model_validate_json(street.model_dump_json(include=written_before))
+    assert old == street
+    assert (old.number, old.is_latest, old.predecessor, old.retired, old.origin) == (
+        1,
+        True,
+        None,
+        False,
+        "published",
+    )
+
+
+def test_a_distance_does_not_depend_on_what_else_is_measured():
+    rng = np.random.default_rng(3)
+    places = np.array([8.4, 49.0]) + rng.normal(0.0, 0.05, (40, 1, 2))
+    paths = [place + rng.normal(0.0, 0.01, (1 + number % 7, 2)) for number, place in enumerate(places)]
+    together = distances_m(paths, 49.01, 8.43)
+    assert together.tolist() == [float(distances_m([path], 49.01, 8.43)[0]) for path in paths]
+    assert together[::-1].tolist() == distances_m(paths[::-1], 49.01, 8.43).tolist()
+    assert distances_m([], 49.01, 8.43).shape == (0,)

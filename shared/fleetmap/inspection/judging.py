@@ -55,6 +55,16 @@ def judge_drive(
         DriveError: it cannot be read at all, or a topic that was asked for is not there.
     """
     contents = look_through(path, image_topic=image_topic, gnss_topic=gnss_topic)
+    return judge_contents(contents, look_at_images=look_at_images, progress=progress)
+
+
+def judge_contents(
+    contents: DriveContents,
+    *,
+    look_at_images: bool = True,
+    progress: Progress = lambda stage, done, total: None,
+) -> DriveJudgement:
+    """The same for a recording that has been looked through already."""
     track = GnssTrack.of(contents.fixes) if contents.fixes else None
     gnss = measure_gnss(track, np.array(contents.stamps_ns, dtype=np.int64)) if track is not None else None
     images, offset = None, ClockOffset(None, None, "the images were not looked at", None)

@@ -3,19 +3,40 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from threading import RLock
 from typing import TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from fleetmap.errors import ServerError, ServerRefusedError, ServerUnreachableError, StorageError, TransferError
+from fleetmap.errors import (
+    AccessDeniedError,
+    ConflictError,
+    JobLostError,
+    RunError,
+    ServerRefusedError,
+    ServerUnreachableError,
+    StorageError,
+    TransferError,
+)
 from fleetmap.transport import protocol
-from fleetmap.transport.session import Connection, NoAnswerError, ProblemError, Question, unreachable
+from fleetmap.transport.connecting import connect
+from fleetmap.transport.endpoints import check_endpoints
+from fleetmap.transport.operations import OPERATIONS
+from fleetmap.transport.pace import Pace
+from fleetmap.transport.session import Connection, NoAnswerError, ProblemError, Question
 
-_CONNECT_TIMEOUT_S = 2.0
-_HELLO_TIMEOUT_S = 2.5  # from the first attempt to connect
+_GREETING_S = 1.8  # a server that is not there is told within 2 s,
+_REFUSED_S = 0.5  # sooner where its machine is there and says so; it may be starting just now
+_MAX_TIMEOUT_GROWTH = 8
 _PAUSE_S = 0.1  # between two attempts at the same request
 _STATUS_BUSY, _STATUS_DISK_FULL = 503, 507
+_REFUSALS: dict[str, type[RunError]] = {
+    "unauthorized": AccessDeniedError,
+    "forbidden": AccessDeniedError,
+    "conflict": ConflictError,
+    "job-lost": JobLostError,
+}
 
 Parameters = Mapping[str, str | int | float]
 Message = TypeVar("Message", bound=BaseModel)
@@ -25,24 +46,52 @@ class ServerLink:
     """A connection to one map server; every request of the protocol may be asked again, and is.
 
     Args:
-        endpoint: ``tcp/HOST:PORT``.
+        endpoint: ``tcp/HOST:PORT``, or several of servers that have the same maps, with commas between.
         timeout_s: how long one request may take on a connection that stands.
         patience_s: how long a server may give no answer before a request is given up.
+        token: goes with every request.
 
     Raises:
         InputError: the endpoint is malformed.
-        ServerUnreachableError: no map server answered within about 3 s.
+        AccessDeniedError: the server wants a token, or another one.
+        ServerRefusedError: it speaks another version of the protocol.
+        ServerUnreachableError: no map server answered within 2 s.
     """
 
-    def __init__(self, endpoint: str, timeout_s: float, patience_s: float) -> None:
-        self.endpoint = protocol.check_endpoint(endpoint)
+    def __init__(
+        self,
+        endpoint: str,
+        timeout_s: float,
+        patience_s: float,
+        token: str | None = None,
+    ) -> None:
+        self.endpoint = endpoint
+        self._endpoints = check_endpoints(endpoint)
+        self._token = token
+        self._prepare: list[Callable[[Connection], None]] = []
+        self._lock = RLock()  # of the connection's replacement
+        self._is_closed = False
         self._timeout_s = timeout_s
         self._patience_s = patience_s
-        self._connection = self._connect(time.monotonic() + _HELLO_TIMEOUT_S)
+        self.pace = {protocol.CHUNK: Pace(), protocol.UPLOAD_CHUNK: Pace()}
+        now_s = time.monotonic()
+        self._connection = self._connect(now_s + _GREETING_S, now_s + _REFUSED_S)
 
     def close(self) -> None:
-        """End the connection."""
+        """End the connection for good; what is under way in other threads ends without an answer."""
+        self._is_closed = True
         self._connection.close()
+
+    @property
+    def is_broken(self) -> bool:
+        """Whether the next request will need a new connection."""
+        return self._connection.is_broken
+
+    def attach(self, prepare: Callable[[Connection], None]) -> None:
+        """Have something done with the connection, and with each that replaces it."""
+        with self._lock:
+            self._prepare.append(prepare)
+            prepare(self._connection)
 
     def request(self, message: type[Message], operation: str, parameters: Parameters) -> Message:
         """Ask for a JSON message.
@@ -61,14 +110,16 @@ class ServerLink:
             raise TransferError(f"map server at {self.endpoint} answers what no {message.__name__} is") from error
 
     def start(self, operation: str, parameters: Parameters, payload: bytes | None = None) -> PendingRequest:
-        """Send a request without waiting; requests with a payload, and for chunks, give way to small ones."""
+        """Send a request without waiting; those of bulk operations give way to small ones."""
         return PendingRequest(self, operation, parameters, payload)
 
-    def send(self, operation: str, parameters: Parameters, payload: bytes | None) -> Question:
-        """One attempt at a request."""
+    def send(self, operation: str, parameters: Parameters, payload: bytes | None, attempts: int = 0) -> Question:
+        """One attempt at a request, more patient than those before: what is slow must not begin anew forever."""
         words = {name: str(value) for name, value in parameters.items()}
-        bulk = payload is not None or operation == protocol.CHUNK
-        return self._connection.ask(operation, words, payload, self._timeout_s, bulk)
+        bulk = OPERATIONS[operation].bulk
+        return self._connection.ask(
+            operation, words, payload, self._timeout_s * min(2**attempts, _MAX_TIMEOUT_GROWTH), bulk
+        )
 
     def answer(self, question: Question, operation: str, parameters: Parameters, payload: bytes | None) -> bytes:
         """The answer to a request already sent.
@@ -77,9 +128,14 @@ class ServerLink:
         ends only after at least one more attempt, if there is a server to connect to.
         """
         deadline_s: float | None = None
+        losses = 0
         while True:
             try:
-                return question.answer()
+                answer = question.answer()
+                if operation in self.pace:
+                    carried_bytes = len(answer) + len(payload or b"")
+                    self.pace[operation].note_answer(carried_bytes, question.asked_s, question.answered_s)
+                return answer
             except ProblemError as error:
                 deadline_s = deadline_s or time.monotonic() + self._patience_s
                 if error.problem.status != _STATUS_BUSY or time.monotonic() > deadline_s:
@@ -90,50 +146,39 @@ class ServerLink:
                     raise NoAnswerError(f"map server at {self.endpoint} answers no more") from error
                 deadline_s = deadline_s or time.monotonic() + self._patience_s
                 self._replace(question.connection, deadline_s)
-            question = self.send(operation, parameters, payload)
+                for pace in self.pace.values():
+                    pace.note_loss()
+                losses += 1
+            question = self.send(operation, parameters, payload, losses)
 
     def _replace(self, failed: Connection, deadline_s: float) -> None:
         """Connect anew, unless that was done since ``failed`` failed; raises NoAnswerError at the deadline."""
-        if failed is not self._connection:
-            return
-        failed.close()
-        try:
-            self._connection = self._connect(deadline_s)
-        except ServerUnreachableError as error:
-            raise NoAnswerError(f"map server at {self.endpoint} answers no more") from error
-
-    def _connect(self, deadline_s: float) -> Connection:
-        """A connection to a map server that says hello; raises ServerUnreachableError at the deadline."""
-        while (left_s := deadline_s - time.monotonic()) > 0.0:
+        with self._lock:
+            if failed is not self._connection:
+                return
+            failed.close()
             try:
-                connection = Connection(self.endpoint, min(left_s, _CONNECT_TIMEOUT_S))
-            except ServerUnreachableError:
-                time.sleep(_PAUSE_S)
-                continue
-            try:
-                self._await_hello(connection, deadline_s)
-                return connection
-            except NoAnswerError:
-                connection.close()
-            except BaseException:
-                connection.close()
-                raise
-        raise ServerUnreachableError(unreachable(self.endpoint))
+                if not self._is_closed:
+                    self._connection = self._connect(deadline_s, deadline_s)
+            except ServerUnreachableError as error:
+                raise NoAnswerError(f"map server at {self.endpoint} answers no more") from error
+            if self._is_closed:  # before, or meanwhile
+                self._connection.close()
+                raise NoAnswerError(f"the connection to {self.endpoint} was closed")
 
-    def _await_hello(self, connection: Connection, deadline_s: float) -> None:
-        """Make sure that a map server is behind the connection: Zenoh alone does not tell."""
-        while not connection.is_broken and (left_s := deadline_s - time.monotonic()) > 0.0:
-            try:
-                hello = connection.ask(protocol.HELLO, {}, None, timeout_s=left_s).answer()
-            except (NoAnswerError, ProblemError):  # not there yet, or busy
-                time.sleep(_PAUSE_S)
-                continue
-            self.read(protocol.Hello, hello)
-            return
-        raise NoAnswerError("no map server says hello")
+    def _connect(self, deadline_s: float, refused_deadline_s: float) -> Connection:
+        """A connection to a map server that says hello; raises as ``connect``."""
+        connection, self.hello = connect(self._endpoints, self._token, deadline_s, refused_deadline_s)
+        for prepare in self._prepare:
+            prepare(connection)
+        return connection
 
-    def _refusal(self, problem: protocol.Problem) -> ServerError | StorageError:
-        kind = StorageError if problem.status == _STATUS_DISK_FULL else ServerRefusedError
+    def _refusal(self, problem: protocol.Problem) -> RunError:
+        kind = _REFUSALS.get(problem.type.removeprefix(protocol.PROBLEM_TYPE_PREFIX), ServerRefusedError)
+        if problem.status == _STATUS_DISK_FULL:
+            kind = StorageError
+        elif problem.status == _STATUS_BUSY:  # for all of our patience: as good as away
+            kind = ServerUnreachableError
         return kind(f"map server at {self.endpoint}: {problem.detail}")
 
 

@@ -8,10 +8,13 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from queue import Empty, SimpleQueue
 from threading import Event
 from typing import Any
+from urllib.parse import quote
 
 import zenoh
 from pydantic import ValidationError
@@ -24,6 +27,9 @@ from fleetmap.transport import protocol
 # no more at once than fits (see CHUNK_BYTES), and nothing ever waits.
 _QUEUE_BATCHES = 16
 _QUEUES = ("interactive_high", "background")
+# Should it happen all the same, a router waits briefly, then hangs up on that client; a client waits for its link.
+_PATIENCE_WITH_FULL_QUEUE = "transport/link/tx/queue/congestion_control/block/wait_before_close"
+_ROUTER_WAITS_US, _CLIENT_WAITS_US = 1_000_000, 60_000_000
 _LOOK_UP_S = 0.2  # how often someone who waits looks whether the connection still stands
 _MAX_MESSAGE_BYTES = 8 * 1024 * 1024  # what a peer may make us buffer; chunks are far smaller
 
@@ -52,24 +58,34 @@ class Connection:
     Args:
         endpoint: ``tcp/HOST:PORT`` of the server.
         timeout_s: how long to try to connect.
+        token: goes with every request.
 
     Raises:
         ServerUnreachableError: nothing that speaks Zenoh accepts connections there.
     """
 
-    def __init__(self, endpoint: str, timeout_s: float) -> None:
+    def __init__(self, endpoint: str, timeout_s: float, token: str | None = None) -> None:
+        self.endpoint = endpoint
+        self.server_id = ""  # of the server that requests go to; see ``greet``
+        self.token = token
         settings: dict[str, Any] = {
             "mode": "client",
             "connect/endpoints": [endpoint],
             "connect/timeout_ms": round(1e3 * timeout_s),
             "connect/exit_on_failure": True,
+            _PATIENCE_WITH_FULL_QUEUE: _CLIENT_WAITS_US,
         }
         try:
             self._session = zenoh.open(_config(settings))
         except zenoh.ZError as error:
-            raise ServerUnreachableError(unreachable(endpoint)) from error
+            raise ServerUnreachableError(
+                f"what listens at {endpoint} is no map server; give its endpoint"
+            ) from error
         self._broken = Event()
-        self._events = self._session.info.declare_transport_events_listener(self._note)
+        self._declared: list[object] = []  # what Zenoh forgets once nobody holds it
+        self._events = self._session.info.declare_transport_events_listener(
+            zenoh.handlers.Callback(self._note, indirect=False)
+        )
 
     @property
     def is_broken(self) -> bool:
@@ -84,6 +100,33 @@ class Connection:
         except zenoh.ZError as error:  # it waited for a link that is dead
             _log.debug("closing: %s", error)
 
+    def greet(self, timeout_s: float) -> bytes:
+        """A server's answer to hello; preferably of the one at the other end, else of any that can be reached.
+
+        Raises:
+            NoAnswerError: no map server can be reached over this connection, or none answered in time.
+            ProblemError: as ``Question.answer``.
+        """
+        nearest = [protocol.server_key(str(zid), protocol.HELLO) for zid in self._session.info.routers_zid()]
+        deadline_s = time.monotonic() + timeout_s
+        for key in (*nearest, protocol.HELLO_KEY, protocol.ANY_VERSION_HELLO):
+            left_s = deadline_s - time.monotonic()
+            with suppress(NoAnswerError):
+                return self._get(key, {}, None, max(left_s, _LOOK_UP_S), bulk=False).answer()
+        raise NoAnswerError("no map server says hello")
+
+    def watch(self, key_expression: str, notice: Callable[[bytes], None]) -> None:
+        """Hand every sample published under some keys to ``notice``, on a thread of Zenoh's."""
+        with suppress(zenoh.ZError):  # on a connection that has just been lost; the next will do it
+            self._declared.append(
+                self._session.declare_subscriber(key_expression, lambda sample: notice(sample.payload.to_bytes()))
+            )
+
+    def be_alive_as(self, key: str) -> None:
+        """Keep a liveliness token as long as it stands."""
+        with suppress(zenoh.ZError):
+            self._declared.append(self._session.liveliness().declare_token(key))
+
     def ask(
         self,
         operation: str,
@@ -92,23 +135,29 @@ class Connection:
         timeout_s: float,
         bulk: bool = False,
     ) -> Question:
-        """Send a request and return at once; ``bulk`` requests give way to small ones."""
+        """Send a request to the greeted server and return at once; ``bulk`` requests give way to small ones."""
+        return self._get(protocol.server_key(self.server_id, operation), parameters, payload, timeout_s, bulk)
+
+    def _get(
+        self, key: str, parameters: Mapping[str, str], payload: bytes | None, timeout_s: float, bulk: bool
+    ) -> Question:
         question = Question(self)
         if self.is_broken:
             question.end()
             return question
         try:
             self._session.get(
-                zenoh.Selector(f"{protocol.KEY_PREFIX}/{operation}", zenoh.Parameters(dict(parameters))),
+                zenoh.Selector(key, zenoh.Parameters({name: quote(text) for name, text in parameters.items()})),
                 zenoh.handlers.Callback(question.take, question.end, indirect=False),
                 payload=payload,
+                attachment=self.token,
                 timeout=timeout_s,
                 consolidation=zenoh.ConsolidationMode.NONE,
                 congestion_control=zenoh.CongestionControl.BLOCK,
                 priority=zenoh.Priority.BACKGROUND if bulk else zenoh.Priority.INTERACTIVE_HIGH,
             )
         except zenoh.ZError as error:
-            _log.debug("cannot ask for %s: %s", operation, error)
+            _log.debug("cannot ask for %s: %s", key, error)
             question.end()
         return question
 
@@ -122,10 +171,12 @@ class Question:
 
     def __init__(self, connection: Connection) -> None:
         self.connection = connection
+        self.asked_s = self.answered_s = time.monotonic()
         self._replies: SimpleQueue[zenoh.Reply | None] = SimpleQueue()  # None: there will be no more
 
     def take(self, reply: zenoh.Reply) -> None:
         """Zenoh's callback for each reply."""
+        self.answered_s = time.monotonic()
         self._replies.put(reply)
 
     def end(self) -> None:
@@ -162,21 +213,44 @@ def _problem(data: bytes) -> protocol.Problem:
         return protocol.Problem(title="Unknown", status=500, detail="it failed without saying why")
 
 
-def open_router(endpoint: str) -> zenoh.Session:
-    """A session in router mode that listens for clients.
+# Any client of a router may say that it answers any key. Requests carry tokens, so they end at this server: what
+# is asked over its router is never passed on to somebody who pretends to be one.
+_NO_REQUEST_LEAVES = {
+    "enabled": True,
+    "default_permission": "allow",
+    "rules": [
+        {
+            "id": "requests",
+            "messages": ["query"],
+            "flows": ["egress"],
+            "permission": "deny",
+            "key_exprs": ["fleetmap/**"],
+        }
+    ],
+    "subjects": [{"id": "everybody"}],
+    "policies": [{"rules": ["requests"], "subjects": ["everybody"]}],
+}
+
+
+def open_router(endpoint: str, peers: Sequence[str] = ()) -> zenoh.Session:
+    """A session in router mode that listens for clients, and forms a mesh with ``peers``, once they are there.
 
     Raises:
         RunError: the endpoint cannot be listened on, for instance because another server does.
     """
+    settings: dict[str, Any] = {
+        "mode": "router",
+        "listen/endpoints": [endpoint],
+        "connect/endpoints": list(peers),
+        "connect/timeout_ms": -1,  # for as long as it takes, in the background
+        "connect/exit_on_failure": False,
+        _PATIENCE_WITH_FULL_QUEUE: _ROUTER_WAITS_US,
+        "access_control": _NO_REQUEST_LEAVES,
+    }
     try:
-        return zenoh.open(_config({"mode": "router", "listen/endpoints": [endpoint]}))
+        return zenoh.open(_config(settings))
     except zenoh.ZError as error:
         raise RunError(f"cannot listen on {endpoint}: {_reason(error)}; is a server running already?") from error
-
-
-def unreachable(endpoint: str) -> str:
-    """The line for a server that is not there."""
-    return f"no map server answers at {endpoint}; start one with 'fleetmap serve', or give its endpoint"
 
 
 def _config(settings: Mapping[str, Any]) -> zenoh.Config:
