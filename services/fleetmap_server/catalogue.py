@@ -1,175 +1,296 @@
-"""The list of published maps: one SQLite file that remembers every version and knows the latest."""
+"""The list of published maps: every version each map ever had, which one counts, and where they lie.
+
+A map's versions are numbered without gaps. Publishing and rolling back both add the next number, so what is the
+latest only ever moves forward, and what was published can be told in order by its serial.
+"""
 
 from __future__ import annotations
 
-import sqlite3
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
-from threading import RLock
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from typing import Any
 
+import sqlalchemy as sa
+from sqlalchemy.engine import Connection
+
 from fleetmap.catalogue import MapEntry
-from fleetmap.errors import InputError, StorageError
+from fleetmap.errors import ConflictError
 from fleetmap.manifest import Manifest
+from fleetmap_server import map_search
+from fleetmap_server.boxes import remove_from_index
+from fleetmap_server.database import Database
+from fleetmap_server.history import (
+    append_parts,
+    append_version,
+    find_version,
+    is_known,
+    known_latest,
+    latest_version,
+    number_meant,
+    published_before,
+    short,
+)
+from fleetmap_server.problems import BadRequestError, GoneError, NotFoundError
+from fleetmap_server.search import MapSearch, SearchPage
+from fleetmap_server.version_rows import entries_where
 
-SCHEMA_VERSION = 1
-LonLatBox = tuple[float, float, float, float]  # west, south, east, north; west > east crosses 180 degrees
 
-_SCHEMA = f"""
-CREATE TABLE versions (
-    version TEXT PRIMARY KEY,
-    map_id TEXT NOT NULL,
-    published_ns INTEGER NOT NULL,
-    manifest_bytes INTEGER NOT NULL,
-    west REAL NOT NULL, south REAL NOT NULL, east REAL NOT NULL, north REAL NOT NULL,
-    entry TEXT NOT NULL
-) WITHOUT ROWID;
-CREATE UNIQUE INDEX versions_of_map ON versions (map_id, published_ns);
-CREATE TABLE parts (
-    version TEXT NOT NULL REFERENCES versions (version),
-    sha256 TEXT NOT NULL,
-    size_bytes INTEGER NOT NULL,
-    PRIMARY KEY (version, sha256)
-) WITHOUT ROWID;
-CREATE VIEW latest AS
-    SELECT * FROM versions AS v
-    WHERE published_ns = (SELECT max(published_ns) FROM versions WHERE map_id = v.map_id);
-PRAGMA user_version = {SCHEMA_VERSION};
-"""
+@dataclass(frozen=True)
+class CataloguePart:
+    """A blob that a version's manifest names."""
+
+    sha256: str
+    size_bytes: int
+    kind: str
+    cell: tuple[int, int] | None
 
 
 class Catalogue:
-    """Open the catalogue file, or make it; safe to use from several threads.
+    """The maps in a database. What changes them takes the caller's ``database.writing()`` connection."""
 
-    Raises:
-        InputError: it is no catalogue, or was written by a newer fleetmap.
-        StorageError: it cannot be written.
-    """
+    def __init__(self, database: Database, clock: Callable[[], int] = time.time_ns) -> None:
+        self.database = database
+        self._clock = clock
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._lock = RLock()
-        with self._errors():
-            self._database = sqlite3.connect(path, check_same_thread=False, isolation_level=None)
-        try:
-            self._prepare()
-        except BaseException:
-            self._database.close()
-            raise
+    def add(
+        self,
+        connection: Connection,
+        manifest: Manifest,
+        version: str,
+        manifest_bytes: int,
+        predecessor: str | None,
+    ) -> MapEntry:
+        """Make a version the latest of its map; doing it once more changes nothing.
 
-    def close(self) -> None:
-        """Let go of the file."""
-        with self._lock:
-            self._database.close()
+        Args:
+            connection: of a ``writing()`` block.
+            manifest: of the version.
+            version: SHA-256 of the manifest.
+            manifest_bytes: the manifest's length.
+            predecessor: the version that its publisher saw as the latest; None if there was no such map.
 
-    def add(self, manifest: Manifest, version: str, manifest_bytes: int) -> MapEntry:
-        """Make a version the latest of its map; nothing changes if it is that already."""
-        with self._transaction():
-            current = self.entry(manifest.map_id)
-            if current is not None and current.version == version:
-                return current
-            published_ns = max(time.time_ns(), current.published_ns + 1 if current else 0)
-            entry = MapEntry.from_manifest(manifest, version, manifest_bytes, published_ns)
-            self._database.execute(
-                "INSERT OR REPLACE INTO versions VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
-                (version, entry.map_id, published_ns, manifest_bytes, *entry.bbox_lonlat, entry.model_dump_json()),
-            )
-            self._database.executemany(
-                "INSERT OR REPLACE INTO parts VALUES (?, ?, ?)",
-                {(version, part.sha256, part.size_bytes) for part in manifest.parts},
-            )
-        return entry
+        Returns:
+            Its entry. It is not the latest if the same was published before and has been succeeded since.
 
-    def entry(self, map_id: str, version: str | None = None) -> MapEntry | None:
-        """One version of a map, without ``version`` the latest; None if there is none."""
+        Raises:
+            ConflictError: somebody else published meanwhile.
+        """
+        map_id = manifest.map_id
+        latest = latest_version(connection, map_id)
+        if latest is not None and latest.version == version:
+            return latest
+        if (before := published_before(connection, map_id, version, predecessor)) is not None:
+            return before
+        if (latest.version if latest else None) != predecessor:
+            raise _conflict(map_id, latest, predecessor)
+        entry = MapEntry.from_manifest(manifest, version, manifest_bytes, self._now_ns(latest))
+        append_version(connection, entry, manifest_bytes, predecessor, "published")
+        append_parts(connection, manifest, version)
+        return known_latest(connection, map_id)
+
+    def rollback(
+        self, connection: Connection, map_id: str, version: str | int, latest: str | None = None
+    ) -> MapEntry:
+        """Make an older content the latest again, under a new number; if it is that already, nothing changes.
+
+        Args:
+            connection: of a ``writing()`` block.
+            map_id: the map.
+            version: the content, as in ``entry``.
+            latest: the version that the caller takes for the latest; None to go back whatever it is.
+
+        Raises:
+            NotFoundError: there is no such map or version.
+            GoneError: it was retired.
+            ConflictError: another version than ``latest`` is.
+        """
+        old = find_version(connection, map_id, version)
+        if old is None:
+            raise NotFoundError(f"map '{map_id}' has no version {short(version)}")
+        now = known_latest(connection, map_id)
+        if now.version == old.version:
+            return now
+        if latest is not None and latest != now.version:
+            raise _conflict(map_id, now, latest)
+        manifest_bytes = self._manifest_bytes(connection, old.version)
+        entry = old.model_copy(update={"published_ns": self._now_ns(now)})
+        append_version(connection, entry, manifest_bytes, now.version, "rollback")
+        return known_latest(connection, map_id)
+
+    def retire(self, connection: Connection, map_id: str, version: str | int | None = None) -> int:
+        """Neither list nor serve a version any more, or the whole map; how many numbers it was.
+
+        Args:
+            connection: of a ``writing()`` block.
+            map_id: the map.
+            version: a number, or a hash for all numbers with this content; None for the whole map.
+
+        Raises:
+            NotFoundError: there is no such map or version.
+            BadRequestError: it is the latest version.
+        """
         if version is None:
-            rows = self._rows("SELECT entry FROM latest WHERE map_id = ?", (map_id,))
-        else:
-            rows = self._rows("SELECT entry FROM versions WHERE map_id = ? AND version = ?", (map_id, version))
-        return MapEntry.model_validate_json(rows[0][0]) if rows else None
-
-    def entries(self, box: LonLatBox | None = None, limit: int = -1, offset: int = 0) -> list[MapEntry]:
-        """The latest versions whose bounding boxes meet ``box``, newest first; ``limit`` -1 is none."""
-        where, values = _meets(box) if box is not None else ("1", ())
-        rows = self._rows(
-            f"SELECT entry FROM latest WHERE {where} ORDER BY published_ns DESC, map_id LIMIT ? OFFSET ?",
-            (*values, limit, offset),
+            return self._retire_map(connection, map_id)
+        try:
+            old = find_version(connection, map_id, version)
+        except GoneError:
+            return 0
+        if old is None:
+            raise NotFoundError(f"map '{map_id}' has no version {short(version)}")
+        by_number = number_meant(version) is not None
+        if old.is_latest or (not by_number and known_latest(connection, map_id).version == old.version):
+            raise BadRequestError(
+                f"version {short(old.version)} is the latest of map '{map_id}'; publish or roll back to another "
+                "first, or retire the whole map"
+            )
+        which = "number = :which" if by_number else "version = :which"
+        retired = connection.execute(
+            sa.text(
+                "UPDATE versions SET retired_ns = :now"
+                f" WHERE map_id = :map_id AND {which} AND retired_ns IS NULL AND is_latest = 0"
+            ),
+            {"now": self._clock(), "map_id": map_id, "which": old.number if by_number else old.version},
         )
-        return [MapEntry.model_validate_json(row[0]) for row in rows]
+        return retired.rowcount
 
-    def count(self, box: LonLatBox | None = None) -> int:
-        """How many maps ``entries`` would list without a limit."""
-        where, values = _meets(box) if box is not None else ("1", ())
-        return int(self._rows(f"SELECT count(*) FROM latest WHERE {where}", values)[0][0])
+    def entry(self, map_id: str, version: str | int | None = None) -> MapEntry | None:
+        """One version of a map; None if there is none.
+
+        Args:
+            map_id: the map.
+            version: its number, its hash or the beginning of it (8 digits or more); None for the latest.
+                Of several numbers with one hash it is the highest.
+
+        Raises:
+            GoneError: it was retired.
+            BadRequestError: several versions begin like this, or it is too short.
+        """
+        with self.database.reading() as connection:
+            return find_version(connection, map_id, version)
+
+    def latest(self, connection: Connection, map_id: str) -> MapEntry | None:
+        """The latest version inside a transaction; None for a map that is unknown or retired."""
+        return latest_version(connection, map_id)
+
+    def versions(self, map_id: str) -> list[MapEntry]:
+        """All versions that are not retired, oldest first; empty if there is no such map."""
+        with self.database.reading() as connection:
+            where = "WHERE v.map_id = :map_id AND v.retired_ns IS NULL ORDER BY v.number"
+            return [entry for _, entry in entries_where(connection, where, map_id=map_id)]
+
+    def search(self, search: MapSearch) -> SearchPage:
+        """A page of latest versions. Raises BadRequestError for a cursor that is not of this search."""
+        with self.database.reading() as connection:
+            return map_search.find(connection, search)
+
+    def since(self, serial: int, limit: int = 1000) -> list[tuple[int, MapEntry]]:
+        """What was published or rolled back to after a serial, in order; to go on, give the last one's serial.
+
+        Nothing is ever added before a serial that was told. Versions retired since are among them, as retired.
+        """
+        with self.database.reading() as connection:
+            where = "WHERE v.serial > :serial ORDER BY v.serial LIMIT :limit"
+            return entries_where(connection, where, serial=serial, limit=limit)
+
+    def identity(self) -> str:
+        """Of this catalogue among all; a restored one keeps it."""
+        return str(self._scalar("SELECT value FROM facts WHERE name = 'catalogue_id'"))
+
+    def last_serial(self) -> int:
+        """The serial of what was published last, 0 if nothing was."""
+        return int(self._scalar("SELECT coalesce(max(serial), 0) FROM versions"))
+
+    def count(self) -> int:
+        """How many maps there are."""
+        return int(self._scalar("SELECT count(*) FROM versions WHERE is_latest = 1"))
+
+    def parts(self, version: str) -> list[CataloguePart]:
+        """What a version's manifest names."""
+        return self.parts_of([version])[version]
+
+    def parts_of(self, versions: Iterable[str]) -> dict[str, list[CataloguePart]]:
+        """``parts`` of several versions at once."""
+        found: dict[str, list[CataloguePart]] = {version: [] for version in versions}
+        if not found:
+            return found
+        statement = sa.text(
+            "SELECT version, sha256, size_bytes, kind, cell_east, cell_north FROM parts WHERE version IN :versions"
+            " ORDER BY kind, cell_east, cell_north, sha256"
+        ).bindparams(sa.bindparam("versions", expanding=True))
+        with self.database.reading() as connection:
+            for row in connection.execute(statement, {"versions": list(found)}):
+                cell = (row.cell_east, row.cell_north) if row.cell_east is not None else None
+                found[row.version].append(CataloguePart(row.sha256, row.size_bytes, row.kind, cell))
+        return found
 
     def blob_size(self, version: str, sha256: str) -> int | None:
-        """Size of a version's manifest or part; None if the version has no such blob, or is not published."""
-        rows = self._rows(
-            "SELECT manifest_bytes FROM versions WHERE version = ?1 AND version = ?2"
-            " UNION ALL SELECT size_bytes FROM parts WHERE version = ?1 AND sha256 = ?2",
-            (version, sha256),
+        """Size of a version's manifest or part; None if it has no such blob, or is not published or retired."""
+        size = self._scalar(
+            "SELECT manifest_bytes FROM versions"
+            " WHERE version = :version AND version = :sha256 AND retired_ns IS NULL"
+            " UNION ALL SELECT size_bytes FROM parts WHERE version = :version AND sha256 = :sha256"
+            " AND EXISTS (SELECT 1 FROM versions WHERE version = :version AND retired_ns IS NULL) LIMIT 1",
+            version=version,
+            sha256=sha256,
         )
-        return int(rows[0][0]) if rows else None
+        return None if size is None else int(size)
 
     def has_part(self, map_id: str, sha256: str) -> bool:
-        """Whether any version of the map has this part."""
-        return bool(
-            self._rows(
-                "SELECT 1 FROM parts JOIN versions USING (version) WHERE map_id = ? AND sha256 = ? LIMIT 1",
-                (map_id, sha256),
-            )
+        """Whether any version of the map that is not retired has this part."""
+        found = self._scalar(
+            "SELECT 1 FROM parts JOIN versions ON versions.version = parts.version"
+            " WHERE sha256 = :sha256 AND map_id = :map_id AND retired_ns IS NULL LIMIT 1",
+            map_id=map_id,
+            sha256=sha256,
         )
+        return found is not None
 
-    def _prepare(self) -> None:
-        with self._lock, self._errors():
-            found = int(self._database.execute("PRAGMA user_version").fetchone()[0])
-            if found > SCHEMA_VERSION:
-                raise InputError(
-                    f"{self._path} was written by a newer fleetmap (schema {found}, this one reads "
-                    f"{SCHEMA_VERSION}); upgrade fleetmap or give another --store"
-                )
-            self._database.execute("PRAGMA journal_mode = WAL")
-            self._database.execute("PRAGMA synchronous = FULL")
-            if found == 0:
-                self._database.executescript(f"BEGIN; {_SCHEMA} COMMIT;")
+    def has_blob(self, sha256: str) -> bool:
+        """Whether any version that is not retired is, or has, this manifest or part."""
+        found = self._scalar(
+            "SELECT 1 FROM versions WHERE version = :sha256 AND retired_ns IS NULL"
+            " UNION ALL SELECT 1 FROM parts JOIN versions ON versions.version = parts.version"
+            " WHERE sha256 = :sha256 AND retired_ns IS NULL LIMIT 1",
+            sha256=sha256,
+        )
+        return found is not None
 
-    def _rows(self, sql: str, values: tuple[object, ...]) -> list[tuple[Any, ...]]:
-        with self._lock, self._errors():
-            return self._database.execute(sql, values).fetchall()
+    def _retire_map(self, connection: Connection, map_id: str) -> int:
+        row = connection.execute(
+            sa.text("SELECT serial, west, south, east, north FROM versions WHERE map_id = :id AND is_latest = 1"),
+            {"id": map_id},
+        ).one_or_none()
+        if row is None:
+            if is_known(connection, map_id):
+                return 0
+            raise NotFoundError(f"there is no map '{map_id}'")
+        remove_from_index(connection, "map_boxes", row.serial, (row.west, row.south, row.east, row.north))
+        retired = connection.execute(
+            sa.text(
+                "UPDATE versions SET retired_ns = :now, is_latest = 0 WHERE map_id = :id AND retired_ns IS NULL"
+            ),
+            {"now": self._clock(), "id": map_id},
+        )
+        return retired.rowcount
 
-    @contextmanager
-    def _transaction(self) -> Iterator[None]:
-        with self._lock, self._errors():
-            self._database.execute("BEGIN IMMEDIATE")
-            try:
-                yield
-                self._database.execute("COMMIT")
-            except BaseException:
-                if self._database.in_transaction:
-                    self._database.execute("ROLLBACK")
-                raise
+    def _now_ns(self, latest: MapEntry | None) -> int:
+        """The time, but later than the latest version's, however the clock was set meanwhile."""
+        return max(self._clock(), latest.published_ns + 1 if latest else 0)
 
-    @contextmanager
-    def _errors(self) -> Iterator[None]:
-        try:
-            yield
-        except sqlite3.OperationalError as error:
-            raise StorageError(f"{self._path}: {error}; free some space or check its permissions") from error
-        except sqlite3.DatabaseError as error:
-            raise InputError(f"{self._path} is no catalogue of maps: {error}; give another --store") from error
+    def _manifest_bytes(self, connection: Connection, version: str) -> int:
+        sql = "SELECT manifest_bytes FROM versions WHERE version = :version LIMIT 1"
+        return int(connection.execute(sa.text(sql), {"version": version}).scalar_one())
+
+    def _scalar(self, sql: str, **values: object) -> Any:
+        with self.database.reading() as connection:
+            return connection.execute(sa.text(sql), values).scalar()
 
 
-def _meets(box: LonLatBox) -> tuple[str, tuple[float, ...]]:
-    """SQL that holds for bounding boxes that meet ``box``, and its values.
-
-    Two intervals of longitude meet if each begins before the other ends. If one of them crosses 180 degrees,
-    one of these is enough; if both do, they meet there.
-    """
-    west, south, east, north = box
-    if west <= east:
-        longitudes = "iif(west <= east, west <= ?1 AND east >= ?2, west <= ?1 OR east >= ?2)"
-    else:
-        longitudes = "(west > east OR west <= ?1 OR east >= ?2)"
-    return f"{longitudes} AND south <= ?3 AND north >= ?4", (east, west, north, south)
+def _conflict(map_id: str, latest: MapEntry | None, expected: str | None) -> ConflictError:
+    now = f"version {short(latest.version)} (number {latest.number}) is" if latest else "none is"
+    was = f"version {short(expected)} was" if expected else "there was none"
+    return ConflictError(
+        f"map '{map_id}' has changed meanwhile: {now} the latest now, {was} when this began; "
+        "look at what is new and begin again"
+    )

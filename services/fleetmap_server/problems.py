@@ -6,8 +6,17 @@ import logging
 
 from pydantic import ValidationError
 
-from fleetmap.errors import FleetmapError, InputError, MapPackageError, RunError, StorageError
-from fleetmap.transport.protocol import Problem
+from fleetmap.errors import (
+    ConflictError,
+    DriveError,
+    FleetmapError,
+    InputError,
+    JobLostError,
+    MapPackageError,
+    RunError,
+    StorageError,
+)
+from fleetmap.transport.protocol import PROBLEM_TYPE_PREFIX, Problem
 
 PROBLEM_MEDIA_TYPE = "application/problem+json"
 
@@ -15,7 +24,11 @@ _log = logging.getLogger(__name__)
 
 
 class NotFoundError(InputError):
-    """The server has no such map, version or part."""
+    """The server has no such map, version, part, drive or job."""
+
+
+class GoneError(InputError):
+    """The server had it, and took it out of service."""
 
 
 class IncompleteUploadError(RunError):
@@ -30,30 +43,64 @@ class BadRequestError(InputError):
     """A request that does not say what it must."""
 
 
-# The first row that fits counts.
-_STATUS_AND_TITLE: tuple[tuple[type[Exception], int, str], ...] = (
-    (NotFoundError, 404, "Not found"),
-    (IncompleteUploadError, 409, "Upload incomplete"),
-    (DamagedBlobError, 500, "Stored data damaged"),
-    (MapPackageError, 422, "Not an acceptable map"),
-    (StorageError, 507, "Storage full or failing"),
-    (InputError, 400, "Bad request"),
-    (ValidationError, 400, "Bad request"),
-    (FleetmapError, 500, "Server error"),
+class UnauthorizedError(RunError):
+    """No token, or one that the server does not know."""
+
+
+class ForbiddenError(RunError):
+    """A token that may not do this."""
+
+
+class BusyError(RunError):
+    """The server cannot serve this now; asking again later helps."""
+
+    retry_after_s = 1.0
+
+
+# Kind, status, the end of the problem's type, title. The first row that fits counts.
+_PROBLEMS: tuple[tuple[type[Exception], int, str, str], ...] = (
+    (UnauthorizedError, 401, "unauthorized", "Token needed"),
+    (ForbiddenError, 403, "forbidden", "Not allowed"),
+    (NotFoundError, 404, "not-found", "Not found"),
+    (GoneError, 410, "gone", "Retired"),
+    (IncompleteUploadError, 409, "incomplete", "Upload incomplete"),
+    (ConflictError, 409, "conflict", "Not as it was expected"),
+    (JobLostError, 409, "job-lost", "The job is not yours"),
+    (DamagedBlobError, 500, "damaged", "Stored data damaged"),
+    (MapPackageError, 422, "unacceptable", "Not an acceptable map"),
+    (DriveError, 422, "unacceptable", "Not an acceptable drive"),
+    (StorageError, 507, "storage", "Storage full or failing"),
+    (BusyError, 503, "busy", "Busy"),
+    (InputError, 400, "bad-request", "Bad request"),
+    (ValidationError, 400, "bad-request", "Bad request"),
+    (FleetmapError, 500, "failed", "Server error"),
 )
 
 
 def problem_of(error: Exception) -> Problem:
     """The problem document for whatever a request raised; what nobody foresaw is logged and told as 500."""
-    for kind, status, title in _STATUS_AND_TITLE:
+    for kind, status, name, title in _PROBLEMS:
         if isinstance(error, kind):
-            return Problem(title=title, status=status, detail=_detail(error))
+            return Problem(
+                type=PROBLEM_TYPE_PREFIX + name,
+                title=title,
+                status=status,
+                detail=_detail(error),
+                retry_after_s=getattr(error, "retry_after_s", None),
+            )
     _log.error("request failed", exc_info=error)
-    return Problem(title="Internal error", status=500, detail=f"the server failed: {type(error).__name__}")
+    return Problem(
+        type=PROBLEM_TYPE_PREFIX + "failed",
+        title="Internal error",
+        status=500,
+        detail=f"the server failed: {type(error).__name__}",
+    )
 
 
 def _detail(error: Exception) -> str:
     if not isinstance(error, ValidationError):
         return str(error)
     first = error.errors()[0]
-    return f"'{'.'.join(str(step) for step in first['loc'])}' does not hold: {first['msg']}"
+    message = first["msg"].removeprefix("Value error, ")
+    where = ".".join(str(step) for step in first["loc"])
+    return f"'{where}' does not hold: {message}" if where else message

@@ -2,56 +2,78 @@
 
 from __future__ import annotations
 
-import signal
-import socket
-import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
-from types import FrameType
+from functools import partial
+from threading import Event, Thread
 
-import uvicorn
-
-from fleetmap.errors import InputError, RunError
-from fleetmap_server.http_service import create_app
+from fleetmap.errors import RunError
+from fleetmap_server.access import Access, read_access
+from fleetmap_server.http.app import create_app
+from fleetmap_server.http_face import HttpFace, listening_socket, serving_http
 from fleetmap_server.library import MapLibrary, open_library
+from fleetmap_server.logs import log_request, logging_as
+from fleetmap_server.metrics import ServerMetrics
+from fleetmap_server.readiness import Readiness
 from fleetmap_server.settings import ServerSettings
-from fleetmap_server.zenoh_service import serve_zenoh
+from fleetmap_server.stop_signals import StopRequests, stop_requests
+from fleetmap_server.tidying import tidying
+from fleetmap_server.zenoh_service import ZenohFace
 
-_STARTUP_S, _SHUTDOWN_S = 10.0, 3
 _CHECK_EVERY_S = 1.0
+_LOOK_EVERY_S = 0.05
 
 
 @dataclass(frozen=True)
 class RunningServer:
-    """Where a running server can be reached."""
+    """A running server, and where it can be reached."""
 
     library: MapLibrary
     zenoh_endpoint: str
     http_url: str
-    http_thread: threading.Thread
+    zenoh: ZenohFace
+    http: HttpFace
+
+    def drain(self, within_s: float, hurry: Event) -> bool:
+        """Take no new work and let transfers under way come to their ends, on both faces.
+
+        Args:
+            within_s: how long at most.
+            hurry: ends the waiting once it is set.
+
+        Returns:
+            Whether all of them did.
+        """
+        self.http.stop(within_s)
+        zenoh = Thread(target=self.zenoh.drain, args=(within_s, hurry), name="drain", daemon=True)
+        zenoh.start()
+        while (zenoh.is_alive() or self.http.thread.is_alive()) and not hurry.wait(_LOOK_EVERY_S):
+            pass
+        return not hurry.is_set()
 
 
 def run_server(settings: ServerSettings, announce: Callable[[str], None] = print) -> None:
-    """Serve until SIGINT or SIGTERM; to be called from the main thread.
+    """Serve until SIGINT or SIGTERM, then finish what is under way; to be called from the main thread.
 
     Args:
         settings: what to serve, and where.
         announce: gets one line when both faces are ready.
 
     Raises:
-        As ``running_server`` does; RunError also when the HTTP face ends by itself.
+        As ``running_server`` does; RunError also when the HTTP face ends by itself, or when a second signal cuts
+        off what is under way.
     """
-    stop = threading.Event()
-    with _stop_signals(stop), running_server(settings) as server:
+    with logging_as(settings.log_format), stop_requests() as asked, running_server(settings) as server:
         count = server.library.count()
         announce(
             f"serving {count} map{'' if count == 1 else 's'} of {settings.store}: "
             f"Zenoh {server.zenoh_endpoint}, HTTP {server.http_url}"
         )
-        while not stop.wait(_CHECK_EVERY_S):
-            if not server.http_thread.is_alive():
-                raise RunError(f"the HTTP face at {server.http_url} ended; start the server again")
+        _serve_until(asked, server)
+        if not server.drain(settings.drain_s, asked.at_once):
+            server.http.close(at_once=True)
+            raise RunError("stopped at once by a second signal; what was under way is cut off")
 
 
 @contextmanager
@@ -60,71 +82,36 @@ def running_server(settings: ServerSettings) -> Iterator[RunningServer]:
 
     Raises:
         RunError: an address is in use, or another server uses the store.
-        InputError: an address or the store is not what it should be.
+        InputError: an address, the store or the access file is not what it should be.
         StorageError: the store cannot be written.
     """
+    access = Access() if settings.access_file is None else read_access(settings.access_file)
     with (
-        _listen(settings.http_host, settings.http_port) as http_socket,
-        open_library(settings.store) as library,
-        serve_zenoh(library, settings.zenoh_endpoint),
-        _serve_http(library, http_socket) as http_thread,
+        closing(listening_socket(settings.http_host, settings.http_port)) as listening,
+        open_library(settings) as library,
+        tidying(library),
     ):
-        host, port = http_socket.getsockname()[:2]
-        shown = f"[{host}]" if ":" in host else host
-        yield RunningServer(library, settings.zenoh_endpoint, f"http://{shown}:{port}", http_thread)
+        metrics = ServerMetrics(library.storage.database, library.storage.objects.free_bytes)
+        observe = partial(_note_request, metrics)
+        with ZenohFace(library, settings.zenoh_endpoint, settings.peers, access, observe) as zenoh:
+            metrics.count_vehicles(zenoh.vehicles_online)
+            app = create_app(library, access, metrics, _readiness(library))
+            with serving_http(app, listening) as http:
+                yield RunningServer(library, settings.zenoh_endpoint, http.url, zenoh, http)
 
 
-@contextmanager
-def _serve_http(library: MapLibrary, listening: socket.socket) -> Iterator[threading.Thread]:
-    """Uvicorn in a thread of its own: so signals stay ours."""
-    config = uvicorn.Config(
-        create_app(library),
-        log_level="warning",
-        access_log=False,
-        lifespan="off",
-        ws="none",
-        timeout_graceful_shutdown=_SHUTDOWN_S,
-    )
-    server = uvicorn.Server(config)
-    thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, name="http", daemon=True)
-    thread.start()
-    try:
-        yield thread
-    finally:
-        server.should_exit = True
-        thread.join(2 * _SHUTDOWN_S)
+def _readiness(library: MapLibrary) -> Readiness:
+    return Readiness({"catalogue": library.catalogue.last_serial, "store": library.storage.objects.check})
 
 
-@contextmanager
-def _listen(host: str, port: int) -> Iterator[socket.socket]:
-    """A socket bound to an address, so that an address in use is told before anything else happens."""
-    try:
-        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-    except (OSError, UnicodeError) as error:
-        raise InputError(f"'{host}' is no address to serve HTTP on; for instance 127.0.0.1 or 0.0.0.0") from error
-    with socket.socket(family, kind, protocol) as listening:
-        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            listening.bind(address)
-            listening.listen(128)
-        except (OSError, OverflowError) as error:
-            reason = getattr(error, "strerror", None) or error
-            raise RunError(
-                f"cannot serve HTTP on {host}:{port}: {reason}; is a server running already?"
-            ) from error
-        yield listening
+def _serve_until(asked: StopRequests, server: RunningServer) -> None:
+    while not asked.stop.wait(_CHECK_EVERY_S):
+        if not server.http.thread.is_alive():
+            raise RunError(f"the HTTP face at {server.http_url} ended; start the server again")
 
 
-@contextmanager
-def _stop_signals(stop: threading.Event) -> Iterator[None]:
-    """SIGINT and SIGTERM set ``stop`` instead of ending the process."""
-
-    def ask_to_stop(number: int, frame: FrameType | None) -> None:
-        stop.set()
-
-    before = {number: signal.signal(number, ask_to_stop) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+def _note_request(
+    metrics: ServerMetrics, operation: str, status: int, seconds: float, bytes_in: int, bytes_out: int
+) -> None:
+    metrics.observe("zenoh", operation, status, seconds, bytes_in, bytes_out)
+    log_request("zenoh", operation, status, seconds, bytes_in, bytes_out)

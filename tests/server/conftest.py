@@ -4,18 +4,26 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import logging
 import os
+import secrets
 import signal
 import socket
 import subprocess
 import sys
+import urllib.request
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pytest
+from moto.server import ThreadedMotoServer
 
+from fleetmap.footprint import bounding_box
 from fleetmap.manifest import Manifest, make_manifest, manifest_version
+from fleetmap_cli.benchmarks.postgresql_cluster import PostgresqlCluster, postgresql_cluster
+from fleetmap_cli.benchmarks.workbench import CannotMeasureHereError
 from fleetmap_server.server import RunningServer, running_server
 from fleetmap_server.settings import ServerSettings
 
@@ -48,7 +56,6 @@ def handmade_map(
         hashlib.shake_128(f"{seed}/{number}".encode()).digest(size) for number, size in enumerate(part_sizes)
     ]
     parts = {hashlib.sha256(data).hexdigest(): data for data in contents}
-    lons, lats = [place[0] for place in path_lonlat], [place[1] for place in path_lonlat]
     manifest = make_manifest(
         {
             "map_id": map_id,
@@ -63,7 +70,7 @@ def handmade_map(
                 "cy_px": 240,
                 "distortion": (0, 0, 0, 0, 0),
             },
-            "bbox_lonlat": (min(lons), min(lats), max(lons), max(lats)),
+            "bbox_lonlat": bounding_box(np.array(path_lonlat)),
             "trajectory_lonlat": path_lonlat,
             "parts": [
                 {
@@ -116,6 +123,11 @@ def free_port() -> int:
 
 
 @pytest.fixture
+def unused_ports() -> Callable[[], int]:
+    return free_port
+
+
+@pytest.fixture
 def endpoint() -> str:
     return f"tcp/127.0.0.1:{free_port()}"
 
@@ -129,8 +141,8 @@ def server(tmp_path: Path, endpoint: str) -> Iterator[RunningServer]:
 class ServerProcess:
     """``fleetmap serve`` in a process of its own; ready when constructed."""
 
-    def __init__(self, store: Path, endpoint: str) -> None:
-        arguments = ["serve", "--store", str(store), "--zenoh", endpoint, "--http", "127.0.0.1:0"]
+    def __init__(self, store: Path, endpoint: str, *options: str) -> None:
+        arguments = ["serve", "--store", str(store), "--zenoh", endpoint, "--http", "127.0.0.1:0", *options]
         self.process = subprocess.Popen(
             [sys.executable, "-c", "from fleetmap_cli.main import main; main()", *arguments],
             stdout=subprocess.PIPE,
@@ -157,11 +169,11 @@ class ServerProcess:
 
 
 @pytest.fixture
-def start_server() -> Iterator[Callable[[Path, str], ServerProcess]]:
+def start_server() -> Iterator[Callable[..., ServerProcess]]:
     started: list[ServerProcess] = []
 
-    def start(store: Path, endpoint: str) -> ServerProcess:
-        started.append(ServerProcess(store, endpoint))
+    def start(store: Path, endpoint: str, *options: str) -> ServerProcess:
+        started.append(ServerProcess(store, endpoint, *options))
         return started[-1]
 
     yield start
@@ -173,3 +185,63 @@ def start_server() -> Iterator[Callable[[Path, str], ServerProcess]]:
 @pytest.fixture(scope="module")
 def module_endpoint() -> str:
     return f"tcp/127.0.0.1:{free_port()}"
+
+
+@pytest.fixture(scope="session")
+def postgresql() -> Iterator[PostgresqlCluster]:
+    """A PostgreSQL of the tests' own; they are skipped where it is not installed."""
+    with contextlib.ExitStack() as stack:
+        try:
+            cluster = stack.enter_context(postgresql_cluster())
+        except CannotMeasureHereError as error:
+            pytest.skip(str(error))
+        yield cluster
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def database_url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    """A catalogue that does not exist yet, of either kind."""
+    if request.param == "sqlite":
+        return f"sqlite:///{tmp_path / 'catalogue.sqlite'}"
+    cluster: PostgresqlCluster = request.getfixturevalue("postgresql")
+    return cluster.new_database()
+
+
+@pytest.fixture(scope="session")
+def s3_endpoint() -> Iterator[str]:
+    """The address of an S3 service of our own."""
+    logging.getLogger("werkzeug").setLevel(logging.ERROR)  # it logs every request otherwise
+    service = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    service.start()
+    host, port = service.get_host_and_port()
+    yield f"http://{host}:{port}"
+    service.stop()
+
+
+@pytest.fixture
+def s3_bucket(s3_endpoint: str, monkeypatch: pytest.MonkeyPatch) -> str:
+    """The name of a new and empty bucket; the environment says how to get at it."""
+    monkeypatch.setenv("AWS_ENDPOINT_URL", s3_endpoint)
+    monkeypatch.setenv("AWS_ACCESS_KEY_ID", "test")
+    monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "test")
+    monkeypatch.setenv("AWS_REGION", "us-east-1")
+    name = f"test-{secrets.token_hex(6)}"
+    with urllib.request.urlopen(urllib.request.Request(f"{s3_endpoint}/{name}", method="PUT")):
+        return name
+
+
+@pytest.fixture(params=["folder", "s3"])
+def store_url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    """An object store that is empty, of either kind."""
+    if request.param == "folder":
+        return str(tmp_path / "store")
+    return f"s3://{request.getfixturevalue('s3_bucket')}/prefix"
+
+
+@pytest.fixture(params=["folder, sqlite", "s3, postgresql"])
+def storage_urls(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[str, str]:
+    """An object store and a catalogue that are empty, each kind of both once."""
+    if request.param == "folder, sqlite":
+        return str(tmp_path / "store"), f"sqlite:///{tmp_path / 'catalogue.sqlite'}"
+    cluster: PostgresqlCluster = request.getfixturevalue("postgresql")
+    return f"s3://{request.getfixturevalue('s3_bucket')}/prefix", cluster.new_database()

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import resource
-import socket
 import subprocess
 import sys
-import threading
 import time
 import urllib.request
 from collections.abc import Callable
@@ -17,6 +14,7 @@ import pytest
 
 from fleetmap.errors import StorageError, TransferError
 from fleetmap.transport import MapClient
+from fleetmap_cli.benchmarks.throttling_proxy import Fault, ThrottlingProxy
 
 MIB = 1024 * 1024
 CUT_BYTES = 3 * MIB
@@ -36,55 +34,6 @@ def once_past(limit_bytes: int, act: Callable[[], object]) -> Callable[[int, int
 def items(http_url: str) -> list[str]:
     with urllib.request.urlopen(f"{http_url}/collections/maps/items", timeout=5) as answer:
         return [feature["id"] for feature in json.load(answer)["features"]]
-
-
-class CuttingProxy:
-    """Carries one TCP connection after the other to a server; acts when so many bytes have come back from it."""
-
-    def __init__(self, port: int, limit_bytes: int, act: Callable[[], object]) -> None:
-        self._target, self._left_bytes, self._act = port, limit_bytes, act
-        self._listening = socket.create_server(("127.0.0.1", 0))
-        self.endpoint = f"tcp/127.0.0.1:{self._listening.getsockname()[1]}"
-        self.connections: list[socket.socket] = []
-        threading.Thread(target=self._accept, daemon=True).start()
-
-    def _accept(self) -> None:
-        while True:
-            try:
-                client, _ = self._listening.accept()
-            except OSError:
-                return
-            try:
-                server = socket.create_connection(("127.0.0.1", self._target))
-            except OSError:
-                client.close()
-                continue
-            self.connections += [client, server]
-            threading.Thread(target=self._carry, args=(client, server, False), daemon=True).start()
-            threading.Thread(target=self._carry, args=(server, client, True), daemon=True).start()
-
-    def _carry(self, source: socket.socket, sink: socket.socket, counted: bool) -> None:
-        try:
-            while data := source.recv(65536):
-                sink.sendall(data)
-                if counted and self._left_bytes > 0:
-                    self._left_bytes -= len(data)
-                    if self._left_bytes <= 0:
-                        self._act()
-        except OSError:
-            pass
-        self.cut(source, sink)
-
-    def cut(self, *connections: socket.socket) -> None:
-        for connection in connections or self.connections:
-            with contextlib.suppress(OSError):
-                connection.shutdown(socket.SHUT_RDWR)
-            connection.close()
-
-    def close(self) -> None:
-        self._listening.shutdown(socket.SHUT_RDWR)
-        self._listening.close()
-        self.cut()
 
 
 def port_of(endpoint: str) -> int:
@@ -136,15 +85,16 @@ def test_a_server_killed_during_a_download_costs_one_clear_error(start_server, t
     with MapClient(endpoint) as client:
         client.publish(original.manifest_bytes, original.parts.__getitem__)
 
-    proxy = CuttingProxy(port_of(endpoint), CUT_BYTES, server.kill)
-    with MapClient(proxy.endpoint, patience_s=1.0) as client:
+    killing = ThrottlingProxy(
+        port_of(endpoint), faults=[Fault(CUT_BYTES, stall_s=0.0)], on_fault=lambda fault: server.kill()
+    )
+    with killing as proxy, MapClient(proxy.endpoint, patience_s=1.0) as client:
         begun_s = time.monotonic()
         with pytest.raises(
-            TransferError, match=r"download of map 'karlsruhe' ended .* of 16\.8 MB: map server at"
+            TransferError, match=r"download of part .* of map 'karlsruhe' ended .* of 16\.8 MB: map server at"
         ):
             client.part("karlsruhe", original.version, sha256, len(data))
         assert time.monotonic() - begun_s < 10.0
-    proxy.close()
 
     server = start_server(tmp_path, endpoint)
     assert server.announcement.startswith("serving 1 map ")
@@ -155,12 +105,12 @@ def test_a_server_killed_during_a_download_costs_one_clear_error(start_server, t
 def test_a_cut_connection_costs_a_retry_and_no_data(server, make_map):
     original = make_map(part_sizes=(16 * MIB,))
     ((sha256, data),) = original.parts.items()
-    proxy = CuttingProxy(port_of(server.zenoh_endpoint), CUT_BYTES, lambda: proxy.cut())
-    with MapClient(proxy.endpoint) as client:
-        client.publish(original.manifest_bytes, original.parts.__getitem__, once_past(CUT_BYTES, proxy.cut))
-        assert client.part("karlsruhe", original.version, sha256, len(data)) == data
-    assert len(proxy.connections) >= 2 * 3  # cut in the upload, and cut again in the download
-    proxy.close()
+    faults = [Fault(CUT_BYTES), Fault(original.size_bytes + CUT_BYTES)]  # in the upload, and in the download
+    with ThrottlingProxy(port_of(server.zenoh_endpoint), faults=faults) as proxy:
+        with MapClient(proxy.endpoint) as client:
+            client.publish(original.manifest_bytes, original.parts.__getitem__)
+            assert client.part("karlsruhe", original.version, sha256, len(data)) == data
+        assert proxy.faults_left == 0
 
 
 DYING_CLIENT = """
