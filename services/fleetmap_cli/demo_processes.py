@@ -50,7 +50,7 @@ def running_map_server(store: str, folder: Path) -> Iterator[ServerAddress]:
     Raises:
         RunError: it did not start. It has said why on stderr.
     """
-    endpoint = f"tcp/127.0.0.1:{_free_port()}"
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
     arguments = ["serve", "--store", store, "--zenoh", endpoint, "--http", "127.0.0.1:0"]
     _show(arguments)
     with _process(arguments, folder, stdout=subprocess.PIPE) as process:
@@ -113,7 +113,8 @@ def _show(arguments: Sequence[str]) -> None:
     click.echo(f"$ {shlex.join(['fleetmap', *arguments])}")
 
 
-def _free_port() -> int:
+def free_port() -> int:
+    """A TCP port of this machine that nobody listens on."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])

@@ -29,7 +29,12 @@ VERBS: dict[str, tuple[str, str, str]] = {
     "report": ("report:report", "Draw how good a map is along its road.", "all"),
     "serve": ("serve:serve", "Run the map server (Zenoh and HTTP).", "server"),
     "publish": ("publish:publish", "Send a map to the server.", "server"),
-    "maps": ("maps:maps", "List the maps of a server.", "server"),
+    "maps": ("maps:maps", "List the maps of a server, roll back or retire versions.", "server"),
+    "upload": ("upload:upload", "Send a survey drive to the server, where a map is made of it.", "recordings"),
+    "drives": ("drives:drives", "List and fetch the survey drives of a server.", "server"),
+    "jobs": ("jobs:jobs", "List, cancel and repeat the mapping of uploaded drives.", "server"),
+    "worker": ("worker:worker", "Map the drives that were uploaded to a server.", "mapper"),
+    "store": ("store:store", "Verify, back up, restore and tidy a map server's store.", "server"),
     "localize": (
         "localize:localize",
         "Read a vehicle's UTM pose from its camera, frame by frame.",

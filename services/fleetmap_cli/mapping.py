@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-import re
 import shutil
 import time
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,12 +15,14 @@ from fleetmap.drives.opening import find_mcap
 from fleetmap.errors import InputError
 from fleetmap.manifest import Manifest, Provenance, check_map_id
 from fleetmap.map_package import check_target, open_package, write_package
+from fleetmap.naming import map_id_from
 from fleetmap.trajectory import write_trajectory
+from fleetmap_cli.options import ServerAccess
 from fleetmap_cli.progress import StageBar
 from fleetmap_cli.verbs.publish import publish_package
 from fleetmap_cli.watching import STATE_FOLDER, UnfitMapError
 from fleetmap_mapper.image_mask import read_mask
-from fleetmap_mapper.mapper import map_drive
+from fleetmap_mapper.mapper import Progress, map_drive
 from fleetmap_mapper.settings import MapperSettings
 
 
@@ -42,9 +44,14 @@ def map_recording(
     choice: DriveChoice,
     map_id: str | None = None,
     trajectory: Path | None = None,
+    drive_name: str | None = None,
+    progress: Progress | None = None,
     force: bool = False,
 ) -> Manifest:
     """Map a recording, write the package and, on request, the trajectory of all its images.
+
+    ``drive_name`` is what the manifest calls the drive, its own name by default; ``progress`` hears of the stages
+    in place of a bar on stderr.
 
     Raises:
         FleetmapError: as open_drive, map_drive and write_package do; nothing half-written is left.
@@ -59,11 +66,11 @@ def map_recording(
         antenna_offset_m=choice.antenna_offset_m,
     )
     mask = read_mask(choice.mask, drive.camera) if choice.mask is not None else None
-    with StageBar() as bar:
-        mapped = map_drive(drive, settings, bar, mask)
+    with nullcontext(progress) if progress is not None else StageBar() as told:
+        mapped = map_drive(drive, settings, told, mask)
     stamps_ns = mapped.trajectory.stamps_ns
     provenance = Provenance(
-        drive=drive.name,
+        drive=drive_name or drive.name,
         drive_sha256=_sha256(find_mcap(recording)),
         fleetmap_version=__version__,
         settings=settings.model_dump(mode="json"),
@@ -85,7 +92,9 @@ def map_recording(
     return manifest
 
 
-def map_and_publish(recording: Path, *, server: str, settings: MapperSettings, choice: DriveChoice) -> None:
+def map_and_publish(
+    recording: Path, *, server: ServerAccess, settings: MapperSettings, choice: DriveChoice
+) -> None:
     """One drive of the mapper agent. A map whose publishing failed is kept and not made again.
 
     Raises:
@@ -101,18 +110,6 @@ def map_and_publish(recording: Path, *, server: str, settings: MapperSettings, c
         raise UnfitMapError("; ".join(package.manifest.quality.warnings))
     publish_package(package, server)
     shutil.rmtree(output, ignore_errors=True)  # the server has it now
-
-
-def map_id_from(name: str) -> str:
-    """A map id made of a file's or folder's name.
-
-    Raises:
-        InputError: nothing of the name can be used.
-    """
-    identity = re.sub(r"[^a-z0-9_-]+", "-", name.lower()).strip("-_")[:64]
-    if not identity:
-        raise InputError(f"no map id can be made of '{name}'; give one with --map-id")
-    return identity
 
 
 def _is_map_of(folder: Path, recording: Path) -> bool:

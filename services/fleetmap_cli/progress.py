@@ -1,8 +1,10 @@
-"""A progress bar on stderr for work that goes through stages."""
+"""Progress bars on stderr: for work that goes through stages, and for bytes."""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import TracebackType
 from typing import Any
 
@@ -40,3 +42,17 @@ class StageBar:
             self._bar.update(self._bar.total - self._bar.n)
         self._bar.close()
         self._bar = None
+
+
+@contextmanager
+def byte_bar(what: str) -> Iterator[Callable[[int, int], None]]:
+    """A bar to be called with the bytes done and the bytes in total."""
+    with tqdm(
+        desc=what, unit="B", unit_scale=True, unit_divisor=1000, file=sys.stderr, leave=False, disable=None
+    ) as bar:
+
+        def show(done_bytes: int, total_bytes: int) -> None:
+            bar.total = total_bytes
+            bar.update(done_bytes - bar.n)
+
+        yield show

@@ -23,6 +23,8 @@ from typing import Literal
 import click
 
 from fleetmap.errors import (
+    AccessDeniedError,
+    ConflictError,
     FleetmapError,
     InputError,
     RunError,
@@ -39,7 +41,7 @@ MCAP_MAGIC = b"\x89MCAP0\r\n"
 Snapshot = tuple[tuple[str, int, int], ...]  # relative name, size in bytes and time of change in ns of each file
 
 # Not the drive's fault, and likely to pass: the drive keeps its place and is tried again.
-_TEMPORARY = (ServerUnreachableError, TransferError, StorageError)
+_TEMPORARY = (ServerUnreachableError, AccessDeniedError, ConflictError, TransferError, StorageError)
 
 
 class UnfitMapError(RunError):
@@ -113,7 +115,7 @@ class DriveWatcher:
             except _TEMPORARY as error:
                 click.echo(f"{drive.name}: {error}; will be tried again", err=True)
                 settled = False
-                if isinstance(error, ServerUnreachableError):
+                if isinstance(error, ServerUnreachableError | AccessDeniedError):
                     break  # mapping the other drives now would be work for nothing
         return settled
 
@@ -183,14 +185,16 @@ class DriveWatcher:
 
 
 @contextmanager
-def stop_on_signals() -> Iterator[threading.Event]:
+def stop_on_signals(
+    saying: str = "stopping after the drive under way; once more to stop at once",
+) -> Iterator[threading.Event]:
     """An event that SIGTERM or SIGINT sets; a second signal interrupts at once. Main thread only."""
     stop = threading.Event()
 
     def request_stop(_signal: int, _frame: FrameType | None) -> None:
         if stop.is_set():
             raise KeyboardInterrupt
-        click.echo("stopping after the drive under way; once more to stop at once", err=True)
+        click.echo(saying, err=True)
         # Not from here: the interrupted main thread may hold the event's lock just now.
         threading.Thread(target=stop.set).start()
 

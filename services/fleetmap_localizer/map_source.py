@@ -53,15 +53,8 @@ def fetch_map(client: MapClient, map_id: str, version: str | None, cache: PartCa
     """
     data = client.manifest(map_id, version)
     manifest, version = parse_manifest(data, f"map '{map_id}'"), manifest_version(data)
-    parts = [
-        cache.part(
-            record.sha256,
-            record.size_bytes,
-            partial(client.part, map_id, version, record.sha256, record.size_bytes),
-        )
-        for record in manifest.parts
-        if record.kind == "cell"
-    ]
+    sizes_bytes = {record.sha256: record.size_bytes for record in manifest.parts if record.kind == "cell"}
+    parts = cache.parts(sizes_bytes, partial(client.parts, map_id, version))
     return LocalizableMap(map_id, version, manifest.camera.to_camera(), decode_cells(manifest, parts))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 import platformdirs
@@ -22,21 +22,33 @@ class PartCache:
         """Use ``folder``, or the user's cache folder."""
         self._folder = folder or Path(platformdirs.user_cache_dir("fleetmap")) / "parts"
 
-    def part(self, sha256: str, size_bytes: int, download: Callable[[], bytes]) -> bytes:
-        """The part with this hash: from the disk where it is whole, else downloaded and kept.
+    def parts(
+        self, sizes_bytes: Mapping[str, int], download: Callable[[Mapping[str, int]], Iterator[bytes]]
+    ) -> list[bytes]:
+        """Parts by their SHA-256, in order: from the disk where they are whole, else downloaded and kept.
 
         A cache that cannot be written costs a warning, not the pose.
+
+        Args:
+            sizes_bytes: SHA-256 -> length of the part.
+            download: gives the parts that are missing, in their order.
         """
-        path = self._folder / f"{sha256}.bin"
-        kept = _read_whole(path, sha256, size_bytes)
-        if kept is not None:
-            return kept
-        data = download()
+        found = {sha256: _read_whole(self._path(sha256), sha256, size) for sha256, size in sizes_bytes.items()}
+        missing = {sha256: sizes_bytes[sha256] for sha256, data in found.items() if data is None}
+        if missing:
+            for sha256, data in zip(missing, download(missing), strict=True):
+                self._keep(sha256, data)
+                found[sha256] = data
+        return [data for data in found.values() if data is not None]
+
+    def _keep(self, sha256: str, data: bytes) -> None:
         try:
-            write_bytes_atomically(path, data)
+            write_bytes_atomically(self._path(sha256), data)
         except StorageError as error:
             _log.warning("the map is not kept for the next time: %s", error)
-        return data
+
+    def _path(self, sha256: str) -> Path:
+        return self._folder / f"{sha256}.bin"
 
 
 def _read_whole(path: Path, sha256: str, size_bytes: int) -> bytes | None:

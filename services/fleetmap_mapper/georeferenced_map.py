@@ -77,7 +77,7 @@ def adjust_with_fixes(
     )
 
 
-def problem_of(placed: PlacedMap, fixes: Sequence[FixTerm] = (), level_sigma_rad: float = np.pi) -> GlobalProblem:
+def problem_of(placed: PlacedMap, fixes: Sequence[FixTerm] = (), level_sigma_rad: float = np.inf) -> GlobalProblem:
     """All that is to be adjusted; without fixes and with no idea of "down", a matter of images alone."""
     return GlobalProblem(
         placed.camera,

@@ -130,7 +130,7 @@ def _renew_observations(growing: GrowingMap, keyframe: Keyframe, placed: PlacedM
     features = placed.feature_index[rows]
     pixels = seen_anew(keyframe.features.pixels, before, placed.camera)
     pixels[features] = placed.pixels[rows]
-    keyframe.features = replace(keyframe.features, pixels=pixels)
+    keyframe.features = replace(keyframe.features, pixels=pixels, camera=placed.camera)
     keyframe.noise[features] = placed.noise[rows]
     keyframe.is_aligned[features] = placed.is_aligned[rows]
     held = np.flatnonzero(keyframe.landmark_of >= 0)

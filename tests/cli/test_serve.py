@@ -7,12 +7,13 @@ import socket
 import pytest
 
 from fleetmap_server.library import open_library
+from fleetmap_server.settings import ServerSettings
 
 
 def test_help_says_what_it_does_with_its_defaults(fleetmap):
     code, out, _ = fleetmap("serve", "--help")
     assert code == 0
-    for word in ("tcp/127.0.0.1:7447", "127.0.0.1:8000", "default: maps", "Example"):
+    for word in ("tcp/127.0.0.1:7447", "127.0.0.1:8000", "default: maps", "default: 30", "s3://", "Example"):
         assert word in out
 
 
@@ -43,7 +44,37 @@ def test_a_port_in_use_is_one_line(fleetmap, tmp_path, absent_server):
 
 def test_a_second_server_on_the_same_store_is_one_line(fleetmap, tmp_path, absent_server):
     store = tmp_path / "store"
-    with open_library(store):
+    with open_library(ServerSettings(store)):
         code, out, err = fleetmap("serve", "--store", store, "--zenoh", absent_server, "--http", "127.0.0.1:0")
     assert (code, out) == (1, "")
-    assert err == f"error: another map server uses the store {store}; stop it or give another --store\n"
+    assert err.startswith(f"error: another map server uses the store {store}; stop it")
+    assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "complaint"),
+    [
+        (("--store", "s3://bucket/maps"), "give --catalogue"),
+        (("--store", "ftp://host/maps", "--catalogue", "sqlite:///{tmp}/c"), "is no store"),
+        (("--store", "{tmp}/maps", "--catalogue", "mysql://host/maps"), "is no catalogue"),
+        (("--store", __file__), "is a file; give a folder"),
+        (("--store", "{tmp}/maps", "--access", "{tmp}/none"), "cannot read the access file"),
+        (("--store", "{tmp}/maps", "--keep-versions", "0"), "--keep-versions"),
+        (("--store", "{tmp}/maps", "--drain-s", "-1"), "--drain-s"),
+        (("--store", "{tmp}/maps", "--log-format", "xml"), "--log-format"),
+        (("--store", "{tmp}/maps", "--peer", "10.0.0.1:7447"), "no Zenoh endpoint"),
+    ],
+)
+def test_options_that_do_not_go_together_are_one_line(fleetmap, tmp_path, absent_server, options, complaint):
+    words = [word.format(tmp=tmp_path) for word in options]
+    code, out, err = fleetmap("serve", "--zenoh", absent_server, "--http", "127.0.0.1:0", *words)
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert complaint in err
+
+
+def test_a_line_of_the_access_file_that_says_something_else_is_named(fleetmap, tmp_path, absent_server):
+    access = tmp_path / "access"
+    access.write_text("# who\nread *\nadmin me 00\n")
+    code, out, err = fleetmap("serve", "--zenoh", absent_server, "--http", "127.0.0.1:0", "--access", access)
+    assert (code, out) == (2, "")
+    assert f"{access}, line 3" in err

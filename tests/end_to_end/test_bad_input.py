@@ -335,7 +335,7 @@ def test_a_server_killed_during_an_upload_is_one_line_and_the_map_is_not_in_the_
 ):
     server = serve(tmp_path / "store")
     proxy = DeadlyProxy(server, 200_000, "up")
-    run = fleetmap("publish", mapped_survey.package, "--server", proxy.endpoint)
+    run = fleetmap("publish", mapped_survey.package, "--server", proxy.endpoint, "--patience-s", 2)
     assert proxy.has_killed
     proxy.close()
     assert_refused(run, 1, "upload of map 'my_map' ended at ", proxy.endpoint, " again")
@@ -354,11 +354,19 @@ def test_a_server_killed_during_a_download_is_one_line_and_leaves_nothing(mapped
     out, cache = tmp_path / "out", tmp_path / "cache"
     out.mkdir()
     run = fleetmap(
-        "localize", drive, "--server", proxy.endpoint, "--cache", cache, "--trajectory", out / "second.tum"
+        "localize",
+        drive,
+        "--server",
+        proxy.endpoint,
+        "--cache",
+        cache,
+        "--trajectory",
+        out / "second.tum",
+        FLEETMAP_PATIENCE_S="2",
     )
     assert proxy.has_killed
     proxy.close()
-    assert_refused(run, 1, "download of map 'my_map' ended", proxy.endpoint)
+    assert_refused(run, 1, "of map 'my_map' ended", proxy.endpoint)
     assert list(out.iterdir()) == []
     assert not cache.exists() or inventory(cache) == {}
 

@@ -123,12 +123,12 @@ def test_an_interrupted_demonstration_leaves_nothing_behind(
 TWO_SERVERS = """
 import sys
 from pathlib import Path
-from fleetmap_cli.demo_processes import _free_port, interrupted_once, run_verb, running_map_server
+from fleetmap_cli.demo_processes import free_port, interrupted_once, run_verb, running_map_server
 folder = Path(sys.argv[1])
 try:
     with interrupted_once(), running_map_server("first", folder) as server:
         assert server.http_url.startswith("http://127.0.0.1:")
-        another = f"tcp/127.0.0.1:{_free_port()}"
+        another = f"tcp/127.0.0.1:{free_port()}"
         run_verb(["serve", "--store", "second", "--zenoh", another, "--http", "127.0.0.1:0"], folder)
 except KeyboardInterrupt:
     sys.exit(130)

@@ -83,7 +83,7 @@ def test_folders_ports_and_endpoints_of_the_composed_services_fit_together(compo
     ports = {port.split(":")[1] for port in server["ports"]}
     assert ports == {_value(server, "--zenoh").split(":")[-1], _value(server, "--http").split(":")[-1]}
     assert _value(agent, "--server") == f"tcp/map-server:{_value(server, '--zenoh').split(':')[-1]}"
-    assert f":{_value(server, '--http').split(':')[-1]}/healthz" in server["healthcheck"]["test"][-1]
+    assert f":{_value(server, '--http').split(':')[-1]}/readyz" in server["healthcheck"]["test"][-1]
     assert agent["depends_on"] == {"map-server": {"condition": "service_healthy"}}
 
 

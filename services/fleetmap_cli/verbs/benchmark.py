@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import tempfile
 from pathlib import Path
 
 import click
@@ -35,9 +36,21 @@ _NAMES = ("drives", "mapper", "localizer", "server")
 )
 @click.option("--rows", metavar="ROW,ROW,...", help="Measure these rows only.  [default: all]")
 @click.option("--list", "list_rows", is_flag=True, help="Say what the rows measure and need, and measure nothing.")
+@click.option(
+    "--kills",
+    type=click.IntRange(min=1),
+    help="Of the server only: SIGKILL it so often, at any instant, and measure nothing else. Exit code 1 if a map "
+    "is lost or half visible afterwards.",
+)
 @click.option("--force", is_flag=True, help="Replace the results of an earlier run.")
 def benchmark(
-    name: str, data: Path, output: Path | None, rows: str | None, list_rows: bool, force: bool
+    name: str,
+    data: Path,
+    output: Path | None,
+    rows: str | None,
+    list_rows: bool,
+    kills: int | None,
+    force: bool,
 ) -> int | None:
     """Measure NAME, and print its table, or tables, with the commands that make each row.
 
@@ -48,7 +61,8 @@ def benchmark(
                   kind of GNSS beside splines through the same fixes, bad fixes, what each use of the
                   fixes gives, images a second; about an hour in all
       localizer   a second camera in the map of the first
-      server      a map published and fetched over loopback, beside raw TCP
+      server      maps published and fetched beside raw TCP, by a fleet, over slow and broken links, through
+                  restarts; 100,000 maps in a catalogue; a map of a million landmarks
 
     The tables are also written as NAME.md, beside NAME.json and pictures, after every row: what is measured stays
     when a later row is interrupted. A row that fails says why, and the exit code is 1. Recordings and maps are
@@ -58,6 +72,7 @@ def benchmark(
     Examples:
       fleetmap benchmark drives --data DATA --output results
       fleetmap benchmark mapper --rows odo-rtk-5s,odo-consumer
+      fleetmap benchmark server --kills 200
     """
     chosen = _benchmark(name)
     if list_rows:
@@ -65,6 +80,8 @@ def benchmark(
             needs = f" (needs {', '.join(f'DATA/{place}' for place in row.needs)})" if row.needs else ""
             click.echo(f"{row.name:<16} {row.about}{needs}")
         return None
+    if kills is not None:
+        return _kill(name, kills)
     names = [word for word in (rows or "").split(",") if word]
     folder = output or Path(f"benchmark-{name}")
     with interrupted_once():
@@ -77,6 +94,22 @@ def benchmark(
         if outcome.status != "measured":
             click.echo(missing_line(outcome))
     return 1 if any(outcome.status == "failed" for outcome in outcomes) else None
+
+
+def _kill(name: str, kills: int) -> int | None:
+    """The check of crash safety; its verdict is the last line."""
+    if name != "server":
+        raise click.UsageError("--kills goes with 'fleetmap benchmark server'")
+    from fleetmap_cli.benchmarks.server_kills import kill_servers
+
+    with interrupted_once(), tempfile.TemporaryDirectory(prefix="fleetmap-kills-") as folder:
+        report = kill_servers(kills, Path(folder), tell=lambda line: click.echo(line, err=True))
+    for note in report.notes:
+        click.echo(note)
+    counts = ", ".join(f"{count} in {name}" for name, count in sorted(report.by_operation.items()))
+    click.echo(f"killed {counts}")
+    click.echo(str(report))
+    return 1 if report.lost or report.half_visible else None
 
 
 def _benchmark(name: str) -> Benchmark:

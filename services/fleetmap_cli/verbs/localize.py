@@ -15,8 +15,7 @@ from fleetmap.drive import Drive
 from fleetmap.drives import open_drive
 from fleetmap.errors import DriveError
 from fleetmap.trajectory import write_trajectory
-from fleetmap.transport import MapClient
-from fleetmap_cli.options import LAT_LON
+from fleetmap_cli.options import LAT_LON, ServerAccess, optional_server_options
 from fleetmap_localizer.map_source import LocalizableMap, fetch_candidates, fetch_map, read_map
 from fleetmap_localizer.part_cache import PartCache
 from fleetmap_localizer.run import localize_drive
@@ -27,7 +26,8 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
 
 @click.command()
 @click.argument("recording", type=_PATH)
-@click.option("--server", metavar="ENDPOINT", help="Fetch the map from this map server, e.g. tcp/127.0.0.1:7447.")
+@optional_server_options("Fetch the map from this map server, e.g. tcp/127.0.0.1:7447.")
+@click.option("--vehicle-id", metavar="NAME", help="With --server: the vehicle that it sees online meanwhile.")
 @click.option(
     "--map", "map_", metavar="ID|FOLDER", help="With --server: the map's id. Without: the folder of a map package."
 )
@@ -54,7 +54,8 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
 )
 def localize(
     recording: Path,
-    server: str | None,
+    server: ServerAccess,
+    vehicle_id: str | None,
     map_: str | None,
     trajectory: Path,
     covariances: Path | None,
@@ -76,13 +77,13 @@ def localize(
       fleetmap localize second.mcap --server tcp/127.0.0.1:7447 --near 49.0324,8.3429 --trajectory second.tum
       fleetmap localize second.mcap --map my_map --trajectory second.tum
     """
-    if server is None and map_ is None:
+    if not server.is_given and map_ is None:
         raise click.UsageError("where is the map? Give --server ENDPOINT, or --map FOLDER")
     drive = open_drive(recording, image_topic=image_topic, gnss_topic=gnss_topic)
     camera = drive.camera
     if use_gnss and map_ is None and near is None:
         near = _first_fix(drive)
-    with _maps(server, map_, near, cache) as maps:
+    with _maps(server, vehicle_id, map_, near, cache) as maps:
         # disable=None: no bar where stderr is a file or a pipe
         frames = tqdm(
             drive.frames(), total=drive.frame_count, unit="image", desc="localize", file=sys.stderr, disable=None
@@ -102,13 +103,17 @@ def localize(
 
 @contextmanager
 def _maps(
-    server: str | None, map_: str | None, near: tuple[float, float] | None, cache: Path | None
+    server: ServerAccess,
+    vehicle_id: str | None,
+    map_: str | None,
+    near: tuple[float, float] | None,
+    cache: Path | None,
 ) -> Iterator[Iterable[LocalizableMap]]:
-    if server is None:
+    if not server.is_given:
         assert map_ is not None
         yield [read_map(Path(map_))]
         return
-    with MapClient(server) as client:
+    with server.connect(vehicle_id=vehicle_id) as client:
         parts = PartCache(cache)
         if map_ is not None:
             yield [fetch_map(client, map_, None, parts)]

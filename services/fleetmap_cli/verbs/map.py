@@ -11,7 +11,7 @@ import click
 from fleetmap.manifest import CalibrationRecord, Manifest
 from fleetmap.transport import DEFAULT_ENDPOINT
 from fleetmap_cli.mapping import DriveChoice, map_and_publish, map_recording
-from fleetmap_cli.options import XYZ
+from fleetmap_cli.options import XYZ, ServerAccess, optional_server_options
 from fleetmap_cli.watching import stop_on_signals, watch_folder
 from fleetmap_mapper.setting_assignments import with_assignments
 from fleetmap_mapper.settings import CalibrationGroup, CalibrationMode, GnssGroup, GnssMode, MapperSettings
@@ -69,9 +69,7 @@ _CALIBRATION: dict[bool | None, CalibrationMode] = {None: "auto", True: "refined
 @click.option("--force", is_flag=True, help="Replace an existing output.")
 @click.option("-v", "--verbose", is_flag=True, help="Say on stderr how fast it went, and where the time went.")
 @click.option("--watch", type=_PATH, metavar="DIR", help="Map and publish every drive dropped into this folder.")
-@click.option(
-    "--server", metavar="tcp/HOST:PORT", help=f"With --watch: where to publish.  [default: {DEFAULT_ENDPOINT}]"
-)
+@optional_server_options(f"With --watch: where to publish.  [default: {DEFAULT_ENDPOINT}]")
 @click.option("--poll-s", type=click.FloatRange(min=0.1), default=5.0, show_default=True, help="With --watch.")
 def map_(
     recording: Path | None,
@@ -89,7 +87,7 @@ def map_(
     force: bool,
     verbose: bool,
     watch: Path | None,
-    server: str | None,
+    server: ServerAccess,
     poll_s: float,
 ) -> int:
     """Turn the survey drive RECORDING (one camera, GNSS) into a visual map anchored in UTM.
@@ -116,15 +114,13 @@ def map_(
             raise click.UsageError(
                 "--watch names its maps after the drives; it takes no recording, output or map id"
             )
-        run = functools.partial(
-            map_and_publish, server=server or DEFAULT_ENDPOINT, settings=settings, choice=choice
-        )
+        run = functools.partial(map_and_publish, server=server, settings=settings, choice=choice)
         with stop_on_signals() as stop:
             watch_folder(watch, run, poll_s=poll_s, stop=stop)
         return 0
     if recording is None or output is None:
         raise click.UsageError("give a RECORDING and --output FOLDER, or --watch DIR")
-    if server is not None:
+    if server.is_given:
         raise click.UsageError("--server goes with --watch; send a finished map with 'fleetmap publish'")
     manifest = map_recording(
         recording,

@@ -8,20 +8,20 @@ import click
 from tqdm import tqdm
 
 from fleetmap.catalogue import MapEntry
+from fleetmap.errors import ConflictError
 from fleetmap.map_package import MapPackage, open_package, verify_package
-from fleetmap.transport import DEFAULT_ENDPOINT, MapClient
+from fleetmap_cli.options import ServerAccess, server_options
 
 
 @click.command()
 @click.argument("folder", type=click.Path(path_type=Path))
-@click.option(
-    "--server", metavar="tcp/HOST:PORT", default=DEFAULT_ENDPOINT, show_default=True, help="The map server."
-)
-def publish(folder: Path, server: str) -> None:
+@server_options
+def publish(folder: Path, server: ServerAccess) -> None:
     """Send the map in FOLDER to the map server, where it becomes the latest of its id.
 
     Every part is checked first. An upload that was cut goes on where it stopped when the command is
-    run again; what the server already has is not sent.
+    run again; what the server already has is not sent. If somebody else published a version of the same
+    map meanwhile, nothing is published: run the command again if yours is to come after it.
 
     \b
     Example:
@@ -33,13 +33,18 @@ def publish(folder: Path, server: str) -> None:
         reasons = "; ".join(package.manifest.quality.warnings) or "its quality check says so"
         click.echo(f"warning: map '{package.manifest.map_id}' should not be published: {reasons}", err=True)
     entry = publish_package(package, server)
+    if not entry.is_latest:
+        raise ConflictError(
+            f"map '{entry.map_id}' had this content before, as version {entry.number}, and has a newer one; "
+            f"'fleetmap maps rollback {entry.map_id} {entry.number}' makes it the latest again"
+        )
     click.echo(f"published {entry.map_id}  version {entry.version[:12]}  {entry.size_bytes / 1e6:.2f} MB")
 
 
-def publish_package(package: MapPackage, server: str) -> MapEntry:
-    """Send a package to the server at an endpoint, with a progress bar; raises as ``MapClient.publish``."""
+def publish_package(package: MapPackage, server: ServerAccess) -> MapEntry:
+    """Send a package to a server, with a progress bar; raises as ``MapClient.publish``."""
     with (
-        MapClient(server) as client,
+        server.connect() as client,
         tqdm(desc="publish", unit="B", unit_scale=True, unit_divisor=1000, leave=False, disable=None) as bar,
     ):
 
