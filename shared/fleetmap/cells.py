@@ -120,7 +120,7 @@ def merge_cells(anchor: UtmAnchor, cells: Sequence[Cell]) -> LocalizationMap:
     Raises:
         MapPackageError: two cells claim the same keyframe, or their clocks disagree with their keyframes' order.
     """
-    cells = [_EMPTY_CELL, *cells]
+    cells = cells or [_EMPTY_CELL]
     all_keyframe_ids = np.concatenate([cell.keyframe_ids for cell in cells])
     keyframe_ids, keyframe_rows = np.unique(all_keyframe_ids, return_index=True)
     if len(keyframe_ids) != len(all_keyframe_ids):
@@ -211,13 +211,16 @@ def _corner_m(index: CellIndex) -> NDArray[np.float64]:
 
 
 def _take(group: Group, rows: NDArray[Any]) -> Group:
-    return type(group)(**{field.name: getattr(group, field.name)[rows] for field in fields(group)})
+    columns: dict[str, Any] = {field.name: getattr(group, field.name) for field in fields(group)}
+    return type(group)(**{name: None if column is None else column[rows] for name, column in columns.items()})
 
 
 def _joined(groups: Sequence[Group]) -> Group:
-    columns = {
-        field.name: np.concatenate([getattr(group, field.name) for group in groups]) for field in fields(groups[0])
-    }
+    """All rows; a column that one of the groups lacks is left out."""
+    columns: dict[str, Any] = {}
+    for name in (field.name for field in fields(groups[0])):
+        parts = [getattr(group, name) for group in groups]
+        columns[name] = None if any(part is None for part in parts) else np.concatenate(parts)
     return type(groups[0])(**columns)
 
 

@@ -25,6 +25,9 @@ class Keyframes:
     stamps_ns: NDArray[np.int64]  # (K,) int64
     rotations: Array  # (K, 3, 3) float64 map_from_cam
     positions_m: Array  # (K, 3) float64 camera centres in map
+    # (K, 6, 6) float32 of the tangent [rotation (rad), translation (m)] in the camera's frame: the true pose is
+    # map_from_cam @ exp(xi). NaN where no fix determines it; None where the map's writer did not say.
+    covariances: NDArray[np.float32] | None = None
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -43,6 +46,8 @@ class Landmarks:
     normals: NDArray[np.float32]  # (N, 3) float32 mean unit vector from the landmark to its observers
     octaves: NDArray[np.uint8]  # (N,) uint8 pyramid level of the descriptor
     distances_m: NDArray[np.float32]  # (N,) float32 distance at which the descriptor was seen
+    # (N, 2) float32 standard deviation across and along ``normals``; None where the map's writer did not say.
+    sigmas_m: NDArray[np.float32] | None = None
 
     def __len__(self) -> int:
         return len(self.points_m)
