@@ -30,7 +30,9 @@ class Fit:
     """A pose with all that speaks for and against it; pixels are undistorted."""
 
     answer: AbsolutePose
-    matched_px: Array  # (P, 2) features that the pose was fitted to
+    landmarks: NDArray[np.int64]  # (P,) that the pose was fitted to, indices into the map's
+    matched_px: Array  # (P, 2) the features that show them
+    matched_sigmas_px: Array  # (P,) of these features
     predicted_px: Array  # (L, 2) where the landmarks in view should be
     feature_px: Array  # (F, 2) all features of the image
 
@@ -50,24 +52,6 @@ def is_trustworthy(fit: Fit, camera: Camera, settings: GateSettings) -> bool:
         and position_sigma_m <= settings.max_position_sigma_m
         and rotation_sigma_deg <= settings.max_rotation_sigma_deg
     )
-
-
-def best_unrivalled(fits: list[Fit], max_rival: float) -> Fit | None:
-    """The fit with the most inliers; None where another place explains the image almost as well.
-
-    ``max_rival`` is the share of the best's inliers from which on a fit at another place is a rival.
-    """
-    if not fits:
-        return None
-    best = max(fits, key=lambda fit: fit.answer.inlier_count)
-    limit = max_rival * best.answer.inlier_count
-    rivals = [
-        fit
-        for fit in fits
-        if fit.answer.inlier_count >= limit
-        and not is_same_place(fit.answer.map_from_cam, best.answer.map_from_cam)
-    ]
-    return None if rivals else best
 
 
 def _coverage(fit: Fit, agreeing: NDArray[np.int64], camera: Camera) -> float:

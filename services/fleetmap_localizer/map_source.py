@@ -4,29 +4,17 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from fleetmap.camera import Camera
 from fleetmap.errors import MapPackageError, NoPoseError
 from fleetmap.manifest import manifest_version, parse_manifest
 from fleetmap.map_package import decode_cells, open_package
 from fleetmap.transport import MapClient
-from fleetmap.visual_map import LocalizationMap
+from fleetmap_localizer.map_view import LocalizableMap
 from fleetmap_localizer.part_cache import PartCache
 
 _log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class LocalizableMap:
-    """A map that is ready to be localised in."""
-
-    map_id: str
-    version: str  # SHA-256 of the manifest
-    camera: Camera  # of the survey vehicle
-    content: LocalizationMap
 
 
 def read_map(folder: Path) -> LocalizableMap:

@@ -31,6 +31,14 @@ class GateSettings:
 
 
 @dataclass(frozen=True)
+class FittingSettings:
+    """How landmarks are matched around a guess of the pose."""
+
+    max_distance: int = 64  # Hamming bits
+    ratio: float = 0.9
+
+
+@dataclass(frozen=True)
 class RelocalizationSettings:
     """The search from nothing."""
 
@@ -55,8 +63,6 @@ class TrackingSettings:
     """The search around a prediction."""
 
     max_gap_s: float = 1.0  # without a pose for longer, the place is searched for from nothing
-    max_distance: int = 64  # Hamming bits
-    ratio: float = 0.9
     radii_px: tuple[tuple[float, ...], ...] = ((15.0, 5.0), (40.0, 12.0, 5.0))  # the second if the first fails
     min_kept_support: float = 0.6  # of the inliers before; with fewer, other places are looked at as well
     max_acceleration_mps2: float = 15.0  # a pose that the vehicle cannot have reached is not believed
@@ -77,5 +83,6 @@ class LocalizerSettings:
     features: FeatureSettings = field(default_factory=FeatureSettings)
     place_index: PlaceIndexSettings = field(default_factory=PlaceIndexSettings)
     local_map: LocalMapSettings = field(default_factory=LocalMapSettings)
+    fitting: FittingSettings = field(default_factory=FittingSettings)
     relocalization: RelocalizationSettings = field(default_factory=RelocalizationSettings)
     tracking: TrackingSettings = field(default_factory=TrackingSettings)

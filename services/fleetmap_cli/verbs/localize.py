@@ -16,9 +16,12 @@ from fleetmap.drives import open_drive
 from fleetmap.errors import DriveError
 from fleetmap.trajectory import write_trajectory
 from fleetmap_cli.options import LAT_LON, ServerAccess, optional_server_options
-from fleetmap_localizer.map_source import LocalizableMap, fetch_candidates, fetch_map, read_map
+from fleetmap_localizer.map_source import fetch_candidates, fetch_map, read_map
+from fleetmap_localizer.map_supply import WholeMaps
+from fleetmap_localizer.map_view import LocalizableMap
 from fleetmap_localizer.part_cache import PartCache
 from fleetmap_localizer.run import localize_drive
+from fleetmap_localizer.settings import LocalizerSettings
 
 _PATH = click.Path(path_type=Path)
 _FILE = click.Path(path_type=Path, dir_okay=False)
@@ -88,11 +91,13 @@ def localize(
         frames = tqdm(
             drive.frames(), total=drive.frame_count, unit="image", desc="localize", file=sys.stderr, disable=None
         )
-        result = localize_drive(frames, camera, maps)
+        settings = LocalizerSettings()
+        result = localize_drive(frames, camera, WholeMaps(maps, camera, settings), settings)
     write_trajectory(trajectory, result.trajectory())
     if covariances is not None:
         write_covariances(covariances, result.covariances())
-    click.echo(f"map:            {result.map_id} (version {result.version[:12]})")
+    for map_id, version in result.map_versions:
+        click.echo(f"map:            {map_id} (version {version[:12]})")
     click.echo(f"frames:         {result.frame_count}")
     click.echo(f"poses:          {len(result.poses)} ({100.0 * len(result.poses) / result.frame_count:.1f} %)")
     click.echo(f"median inliers: {result.median_inliers}")

@@ -1,0 +1,112 @@
+"""Searching from nothing: like places of all maps, landmarks matched by descriptor alone, then by projection."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fleetmap.camera import Camera
+from fleetmap.geometry import Pose
+from fleetmap.vision.absolute_pose import AbsolutePoseSettings, estimate_absolute_pose
+from fleetmap.vision.features import Features
+from fleetmap.vision.matching import match_descriptors
+from fleetmap_localizer.fitting import fit_around
+from fleetmap_localizer.gate import Fit, is_same_place, is_trustworthy
+from fleetmap_localizer.local_map import Indices
+from fleetmap_localizer.map_view import MapView
+from fleetmap_localizer.settings import LocalizerSettings, RelocalizationSettings
+
+
+@dataclass(frozen=True)
+class Located:
+    """A pose, and the view of a map that it refers to."""
+
+    view: MapView
+    fit: Fit
+
+    @property
+    def inlier_count(self) -> int:
+        """Landmarks that agree with the pose."""
+        return self.fit.answer.inlier_count
+
+    def utm_from_cam(self) -> Pose:
+        """The camera's pose as easting, northing, ellipsoidal height."""
+        pose = self.fit.answer.map_from_cam
+        return Pose(pose.rotation, self.view.anchor.utm_from_map(pose.translation_m))
+
+
+def relocalize(
+    views: Sequence[MapView], camera: Camera, features: Features, settings: LocalizerSettings
+) -> Located | str:
+    """The one place in all maps that explains an image; or why there is none, in words for people."""
+    found: list[Located] = []
+    for view, landmarks in _candidate_places(views, features, settings.relocalization):
+        initial = _pose_among(view, camera, features, landmarks, settings.relocalization)
+        if initial is None or any(_is_found(each, view, initial) for each in found):
+            continue
+        fit = fit_around(view, camera, features, initial, settings.relocalization.radii_px, settings.fitting)
+        if fit is not None:
+            found.append(Located(view, fit))
+    if not found:
+        return "the image shows no place that the map knows"
+    best = max(found, key=lambda each: each.inlier_count)
+    if any(_is_rival(each, best, settings.relocalization.max_rival) for each in found):
+        return "the image could be of two places, which look too much alike"
+    if not is_trustworthy(best.fit, camera, settings.relocalization.gate):
+        return f"too little of the image agrees with the likeliest place ({best.inlier_count} landmarks)"
+    return best
+
+
+def is_same(first: Located, second: Located) -> bool:
+    """Whether two answers say the same, be they of one map or of two."""
+    if first.view.anchor.epsg != second.view.anchor.epsg:
+        return False
+    return is_same_place(first.utm_from_cam(), second.utm_from_cam())
+
+
+def _is_found(one: Located, view: MapView, map_from_cam: Pose) -> bool:
+    return one.view is view and is_same_place(map_from_cam, one.fit.answer.map_from_cam)
+
+
+def _is_rival(one: Located, best: Located, max_rival: float) -> bool:
+    """Whether another place explains the image almost as well; overlapping maps tell of the same place."""
+    return one.inlier_count >= max_rival * best.inlier_count and not is_same(one, best)
+
+
+def _candidate_places(
+    views: Sequence[MapView], features: Features, settings: RelocalizationSettings
+) -> Iterator[tuple[MapView, Indices]]:
+    """Landmarks of the likeliest places, best first; no keyframe stands for two of them."""
+    scores = [view.places.scores(features.descriptors) for view in views]
+    for _ in range(settings.candidates):
+        highest = [float(each.max(initial=0.0)) for each in scores]
+        if not highest or max(highest) <= 0.0:
+            return
+        number = int(np.argmax(highest))
+        local_map, best = views[number].local_map, int(np.argmax(scores[number]))
+        group = np.append(local_map.covisible(best, settings.min_shared_landmarks, settings.neighbours), best)
+        scores[number][group] = 0.0
+        yield views[number], local_map.landmarks_of(group, settings.max_landmarks)
+
+
+def _pose_among(
+    view: MapView, camera: Camera, features: Features, landmarks: Indices, settings: RelocalizationSettings
+) -> Pose | None:
+    """The pose that the matches with these landmarks agree on, by RANSAC."""
+    group = view.content.landmarks
+    pairs = match_descriptors(
+        features.descriptors, group.descriptors[landmarks], settings.max_distance, settings.ratio
+    )
+    if len(pairs) < settings.min_matches:
+        return None
+    seen, matched = pairs[:, 0], landmarks[pairs[:, 1]]
+    answer = estimate_absolute_pose(
+        features.pixels[seen],
+        group.points_m[matched],
+        features.sigmas_px[seen],
+        camera,
+        AbsolutePoseSettings(settings.min_ransac_inliers, settings.ransac_error_px),
+    )
+    return None if answer is None else answer.map_from_cam
