@@ -20,7 +20,7 @@ from fleetmap_mapper.global_adjustment import GlobalProblem, adjust_globally
 from fleetmap_mapper.growing_map import GrowingMap
 from fleetmap_mapper.observation_noise import observation_sigmas
 from fleetmap_mapper.placed_map import PlacedMap, without_outliers
-from fleetmap_mapper.pose_covariances import position_covariances_m2
+from fleetmap_mapper.pose_covariances import pose_covariances
 from fleetmap_mapper.settings import CalibrationGroup
 from fleetmap_mapper.slam import PosedFrame
 from fleetmap_mapper.stage_times import StageTimes
@@ -73,7 +73,7 @@ def adjust_with_fixes(
         placed,
         map_from_vis=umeyama_alignment(before, after),
         calibration=estimate_calibration(problem, calibration, recorded),
-        position_covariances_m2=position_covariances_m2(problem),
+        pose_covariances=pose_covariances(problem),
     )
 
 

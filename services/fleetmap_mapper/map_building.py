@@ -27,6 +27,7 @@ def build_visual_map(placed: PlacedMap, growing: GrowingMap, anchor: UtmAnchor) 
             placed.keyframe_stamps_ns,
             np.array([p.rotation for p in placed.poses]),
             np.array([p.translation_m for p in placed.poses]),
+            None if placed.pose_covariances is None else placed.pose_covariances.astype(np.float32),
         ),
         _landmarks(placed, growing, octaves),
         Observations(placed.keyframe_index, placed.point_index, placed.pixels.astype(np.float32), octaves),

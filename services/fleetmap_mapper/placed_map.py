@@ -36,13 +36,23 @@ class PlacedMap:
     noise: Array  # (M,) how exact the observation is, against that
     is_aligned: NDArray[np.bool_]  # (M,) whether the pixel comes from aligning patches, or is a corner's
     track_correlation: float = 0.0  # of errors from one observation of a landmark to the next
-    position_covariances_m2: Array | None = None  # (K, 3, 3) of the final graph; NaN where no fix determines it
+    # (K, 6, 6) of the final graph, see fleetmap_mapper.pose_covariances; NaN where no fix determines it
+    pose_covariances: Array | None = None
     calibration: CalibrationEstimate | None = None  # as the final graph has it
 
     @property
     def sigmas_px(self) -> Array:
         """Sigma of each observation (M,)."""
         return self.corner_sigmas_px * self.noise
+
+    @property
+    def position_covariances_m2(self) -> Array:
+        """Covariances (K, 3, 3) of the camera centres, in map; NaN where they are not known."""
+        if self.pose_covariances is None:
+            return np.full((len(self.poses), 3, 3), np.nan)
+        rotations = np.array([pose.rotation for pose in self.poses])
+        in_map: Array = rotations @ self.pose_covariances[:, 3:, 3:] @ rotations.transpose(0, 2, 1)
+        return (in_map + in_map.transpose(0, 2, 1)) / 2.0
 
     def observations_of(self, keyframe: int) -> slice:
         """Where the observations of one keyframe stand."""

@@ -75,13 +75,6 @@ def _inverse_blocks(diagonal: list[Array], lower: list[Array]) -> list[Array]:
     return [np.full_like(block, np.nan) for block in diagonal]
 
 
-def position_covariances_m2(problem: GlobalProblem) -> Array:
-    """Covariances (K, 3, 3) float64 of the camera centres, in map; NaN as in ``pose_covariances``."""
-    rotations = np.array([pose.rotation for pose in problem.poses])
-    in_map: Array = rotations @ pose_covariances(problem)[:, 3:, 3:] @ rotations.transpose(0, 2, 1)
-    return (in_map + in_map.transpose(0, 2, 1)) / 2.0
-
-
 def _terms_beside_images(problem: GlobalProblem) -> list[_Term]:
     graph, values = graph_without_images(problem)
     linear = graph.linearize(values)

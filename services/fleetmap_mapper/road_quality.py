@@ -54,14 +54,11 @@ def _keyframe_quality(placed: PlacedMap, trajectory: Trajectory) -> KeyframeQual
     index = placed.keyframe_index[counted]
     seen = np.bincount(index, minlength=count)
     sums = np.bincount(index, weights=squares[counted], minlength=count)
-    covariances_m2 = placed.position_covariances_m2
-    if covariances_m2 is None:
-        covariances_m2 = np.full((count, 3, 3), np.nan)
     return KeyframeQuality(
         placed.keyframe_stamps_ns,
         _along_m(trajectory, placed.keyframe_stamps_ns),
         np.array([pose.translation_m for pose in placed.poses]),
-        covariances_m2.astype(np.float32),
+        placed.position_covariances_m2.astype(np.float32),
         np.sqrt(sums / np.maximum(seen, 1)).astype(np.float32),
         np.bincount(placed.keyframe_index, minlength=count).astype(np.int32),
     )

@@ -14,7 +14,7 @@ from fleetmap.geometry import Pose
 from fleetmap_mapper import global_adjustment
 from fleetmap_mapper.fix_terms import FixTerm
 from fleetmap_mapper.global_adjustment import GlobalProblem, adjust_globally
-from fleetmap_mapper.pose_covariances import pose_covariances, position_covariances_m2
+from fleetmap_mapper.pose_covariances import pose_covariances
 
 ARM = np.array([0.3, -1.2, -0.8])
 FIX_COVARIANCE = np.diag([1.0, 1.5, 4.0]) * 0.05**2
@@ -51,6 +51,12 @@ def gtsam_covariances(problem: GlobalProblem) -> np.ndarray:
         values.insert(L(j), point)
     marginals = gtsam.Marginals(graph, values)
     return np.array([marginals.marginalCovariance(X(i)) for i in range(len(problem.poses))])
+
+
+def position_covariances_m2(problem: GlobalProblem) -> np.ndarray:
+    """Of the camera centres, in map."""
+    rotations = np.array([pose.rotation for pose in problem.poses])
+    return rotations @ pose_covariances(problem)[:, 3:, 3:] @ rotations.transpose(0, 2, 1)
 
 
 def relative_error(found: np.ndarray, wanted: np.ndarray) -> float:

@@ -56,7 +56,7 @@ def judge(make_world: Any) -> Callable[..., Quality]:
             world.sigmas_px,
             np.ones(len(pixels)),
             np.zeros(len(pixels), np.bool_),
-            position_covariances_m2=np.tile(np.eye(3) * sigma_m**2, (KEYFRAMES, 1, 1)),
+            pose_covariances=np.tile(np.diag([1e-6] * 3 + [sigma_m**2] * 3), (KEYFRAMES, 1, 1)),
         )
         stamps = np.arange(KEYFRAMES) * 10**9
         stamps[KEYFRAMES // 2 :] += int(gap_s * 1e9)

@@ -132,7 +132,9 @@ def test_covariances_are_kept_and_unknown_where_there_are_none(straight):
     placed, trajectory = straight
     assert np.isnan(road_of(placed, trajectory).keyframes.horizontal_sigmas_m).all()
     covariance = np.array([[0.04, 0.02, 0.0], [0.02, 0.04, 0.0], [0.0, 0.0, 0.25]])
-    known = replace(placed, position_covariances_m2=np.tile(covariance, (KEYFRAMES, 1, 1)))
+    in_cam = np.zeros((KEYFRAMES, 6, 6))
+    in_cam[:, 3:, 3:] = [pose.rotation.T @ covariance @ pose.rotation for pose in placed.poses]
+    known = replace(placed, pose_covariances=in_cam)
     keyframes = road_of(known, trajectory).keyframes
     np.testing.assert_allclose(keyframes.horizontal_sigmas_m, np.sqrt(0.06), rtol=1e-6)  # along the diagonal
     np.testing.assert_allclose(keyframes.vertical_sigmas_m, 0.5, rtol=1e-6)
