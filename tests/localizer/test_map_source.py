@@ -15,7 +15,8 @@ from fleetmap.errors import MapPackageError, NoPoseError, ServerRefusedError
 from fleetmap.manifest import manifest_version
 from fleetmap.map_package import open_package
 from fleetmap.transport import MapClient
-from fleetmap_localizer.map_source import LocalizableMap, fetch_candidates, fetch_map, read_map
+from fleetmap_localizer.map_source import fetch_candidates, fetch_map, read_map
+from fleetmap_localizer.map_view import LocalizableMap
 from fleetmap_localizer.part_cache import PartCache
 from fleetmap_server.server import running_server
 from fleetmap_server.settings import ServerSettings

@@ -22,7 +22,11 @@ def on_a_bend(seconds: float, speed_mps: float = 12.0, turn_radps: float = 0.4) 
 
 
 def motion_on_a_bend() -> Motion:
-    return Motion(0, on_a_bend(0.0), 100).follow(STEP_NS, on_a_bend(0.1), 100)
+    return motion_at(on_a_bend(0.0)).follow(STEP_NS, on_a_bend(0.1), 100, "street", "a")
+
+
+def motion_at(utm_from_cam: Pose) -> Motion:
+    return Motion(0, utm_from_cam, 100, 32632, "street", "a")
 
 
 @pytest.mark.parametrize("ahead_s", [0.05, 0.1, 0.3])
@@ -34,23 +38,19 @@ def test_a_bend_is_continued(ahead_s: float) -> None:
 
 
 def test_a_vehicle_whose_speed_is_not_known_is_expected_where_it_was() -> None:
-    assert Motion(0, on_a_bend(0.0), 100).predict(STEP_NS) is not None
-    assert np.array_equal(Motion(0, on_a_bend(0.2), 9).predict(STEP_NS).rotation, on_a_bend(0.2).rotation)
+    assert motion_at(on_a_bend(0.0)).predict(STEP_NS) is not None
+    assert np.array_equal(motion_at(on_a_bend(0.2)).predict(STEP_NS).rotation, on_a_bend(0.2).rotation)
 
 
 def test_hard_braking_is_possible_and_a_leap_is_not() -> None:
     motion = motion_on_a_bend()
-    truth = on_a_bend(0.2)
-    assert motion.can_reach(2 * STEP_NS, truth, LIMITS)
-    braked = Pose(truth.rotation, truth.translation_m - np.array([0.0, 0.0, 0.3]))
-    assert motion.can_reach(2 * STEP_NS, braked, LIMITS)
-    leapt = Pose(truth.rotation, truth.translation_m + np.array([1.5, 0.0, 0.0]))
-    assert not motion.can_reach(2 * STEP_NS, leapt, LIMITS)
+    true_m = on_a_bend(0.2).translation_m
+    assert motion.can_reach(2 * STEP_NS, true_m, LIMITS)
+    assert motion.can_reach(2 * STEP_NS, true_m - [0.0, 0.0, 0.3], LIMITS)  # braked
+    assert not motion.can_reach(2 * STEP_NS, true_m + np.array([1.5, 0.0, 0.0]), LIMITS)  # leapt
 
 
 def test_from_an_unknown_speed_only_the_fastest_car_limits() -> None:
-    motion = Motion(0, on_a_bend(0.0), 100)
-    near = Pose(np.eye(3), np.array([0.0, 0.0, 5.0]))
-    far = Pose(np.eye(3), np.array([0.0, 0.0, 20.0]))
-    assert motion.can_reach(STEP_NS, near, LIMITS)
-    assert not motion.can_reach(STEP_NS, far, LIMITS)
+    motion = motion_at(on_a_bend(0.0))
+    assert motion.can_reach(STEP_NS, np.array([0.0, 0.0, 5.0]), LIMITS)
+    assert not motion.can_reach(STEP_NS, np.array([0.0, 0.0, 20.0]), LIMITS)
