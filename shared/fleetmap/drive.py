@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.camera import Camera
+from fleetmap.geometry import Pose
 
 Array = NDArray[np.float64]
 
@@ -60,6 +61,14 @@ class Antenna:
     source: str  # "same frame", "static transform", "option", or "assumed at the camera"
 
 
+@dataclass(frozen=True)
+class SensorMounting:
+    """How a sensor is mounted, and how we know."""
+
+    cam_from_sensor: Pose
+    source: str  # "same frame", "static transform", or "assumed level and forward"
+
+
 class Drive(Protocol):
     """A recorded drive of one camera. Opening it has checked that it can be read."""
 
@@ -87,5 +96,11 @@ class Drive(Protocol):
     def imu_samples(self) -> Iterator[ImuSample]:
         """Inertial measurements in time order; nothing when the recording has none."""
 
+    def imu_mounting(self) -> SensorMounting | None:
+        """How the IMU is mounted; None without one, or where the recording does not say."""
+
     def wheel_speeds(self) -> Iterator[WheelSpeed]:
         """Forward speeds in time order; nothing when the recording has none."""
+
+    def wheel_mounting(self) -> SensorMounting | None:
+        """The frame (x forward, y left, z up) whose origin has the wheels' speed along x; None without speeds."""

@@ -96,6 +96,17 @@ class UtmGrid:
         return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
 
 
+def normal_gravity_m_s2(lat_deg: float, height_m: float) -> float:
+    """Normal gravity of the WGS84 ellipsoid at a latitude, at a height above it.
+
+    Source: NIMA TR8350.2, "Department of Defense World Geodetic System 1984", 2000, eq. 4-1 and 4-3 (to first
+    order in the height).
+    """
+    sin2 = float(np.sin(np.radians(lat_deg)) ** 2)
+    on_ellipsoid = 9.7803253359 * (1.0 + 0.00193185265241 * sin2) / np.sqrt(1.0 - 0.00669437999014 * sin2)
+    return float(on_ellipsoid * (1.0 - 2.0 * height_m / 6_371_000.0))
+
+
 @lru_cache(maxsize=64)
 def _transformer(epsg: int) -> Transformer:
     return Transformer.from_crs("EPSG:4326", f"EPSG:{epsg}", always_xy=True)

@@ -14,6 +14,7 @@ from fleetmap.camera import Camera
 from fleetmap.camera_file import write_camera
 from fleetmap.drives import open_drive
 from fleetmap.geodesy import UtmGrid
+from fleetmap.simulation.mounting import Mounting
 from fleetmap.trajectory import read_trajectory
 
 Run = Callable[..., tuple[int, str, str]]
@@ -70,6 +71,12 @@ def test_a_drive_with_every_sensor_reads_back_as_it_was(fleetmap: Run, tmp_path:
     forces = np.array([sample.linear_acceleration_m_s2 for sample in drive.imu_samples()])
     assert 300 <= len(forces) <= 320
     assert 9.0 < np.median(forces[:, 2]) < 10.6
+    imu, wheels, usual = drive.imu_mounting(), drive.wheel_mounting(), Mounting()
+    assert imu is not None
+    assert wheels is not None
+    for found, mounted_at in ((imu, usual.cam_from_imu), (wheels, usual.cam_from_vehicle)):
+        np.testing.assert_allclose(found.cam_from_sensor.rotation, mounted_at.rotation, atol=1e-9)
+        np.testing.assert_allclose(found.cam_from_sensor.translation_m, mounted_at.translation_m, atol=1e-9)
     speeds = np.array([speed.speed_mps for speed in drive.wheel_speeds()])
     assert 75 <= len(speeds) <= 80
     way_m = np.linalg.norm(np.diff(reference.positions_m, axis=0), axis=1).sum()

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from fleetmap.camera import Camera
-from fleetmap.drive import Antenna, Frame, GnssFix, ImuSample, WheelSpeed
+from fleetmap.drive import Antenna, Frame, GnssFix, ImuSample, SensorMounting, WheelSpeed
 from fleetmap.drives import open_drive
 from fleetmap.geometry import Pose, so3_exp
 from fleetmap_mapper.mapper import MappedDrive, map_drive
@@ -135,8 +135,14 @@ class DriveInMemory:
     def imu_samples(self) -> Iterator[ImuSample]:
         return iter(())
 
+    def imu_mounting(self) -> SensorMounting | None:
+        return None
+
     def wheel_speeds(self) -> Iterator[WheelSpeed]:
         return iter(())
+
+    def wheel_mounting(self) -> SensorMounting | None:
+        return None
 
     def blacked_out(self, first: int, last: int) -> DriveInMemory:
         """The same with images ``first`` to ``last`` black."""

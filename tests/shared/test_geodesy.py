@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from pyproj import Geod
 
 from fleetmap.errors import InputError
-from fleetmap.geodesy import UtmAnchor, UtmGrid, utm_epsg
+from fleetmap.geodesy import UtmAnchor, UtmGrid, normal_gravity_m_s2, utm_epsg
 
 GEOD = Geod(ellps="WGS84")
 latitudes = st.floats(-79.5, 83.5)
@@ -97,6 +97,13 @@ def test_true_directions_turn_into_grid_directions(azimuth_deg):
     turned = grid.grid_from_enu(lat_deg, lon_deg) @ enu * grid.point_scale_factor(lat_deg, lon_deg)
     assert turned == pytest.approx(second - first, abs=1e-4)
     assert np.linalg.norm(enu - (second - first)) > 0.3  # taking UTM for ENU would show
+
+
+def test_gravity_is_what_the_standard_publishes():
+    """NIMA TR8350.2, table 3.4: at the equator and at the poles; it wanes by 3.1 um/s2 a metre."""
+    assert normal_gravity_m_s2(0.0, 0.0) == pytest.approx(9.7803253359, abs=1e-9)
+    assert normal_gravity_m_s2(-90.0, 0.0) == pytest.approx(9.8321849378, abs=1e-8)
+    assert normal_gravity_m_s2(45.0, 1000.0) - normal_gravity_m_s2(45.0, 0.0) == pytest.approx(-3.086e-3, abs=2e-5)
 
 
 def test_an_anchor_is_whole_metres_and_cancels():

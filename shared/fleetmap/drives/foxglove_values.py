@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from fleetmap.drive import ImuSample, WheelSpeed
+from fleetmap.drive import WheelSpeed
 from fleetmap.drives.messages import (
     CALIBRATIONS,
     FIXES,
@@ -24,6 +24,7 @@ from fleetmap.drives.messages import (
     CompressedPicture,
     FixMessage,
     ImageMessage,
+    ImuMessage,
     RawPicture,
     Reading,
     Readings,
@@ -94,16 +95,17 @@ def _odometry(message: Any) -> Iterator[SpeedMessage]:
         yield SpeedMessage(_frame_id(message.body_frame_id), WheelSpeed(_stamp_ns(message.timestamp), speed_mps))
 
 
-def _imu(message: Any) -> Iterator[ImuSample]:
+def _imu(message: Any) -> Iterator[ImuMessage]:
     angular, linear = message.angular_velocity, message.linear_acceleration
     sample = imu_sample_of(
         _imu_stamp_ns(message), (angular.x, angular.y, angular.z), (linear.x, linear.y, linear.z)
     )
     if sample is not None:
-        yield sample
+        own = message if hasattr(message, "frame_id") else getattr(message, "header", None)
+        yield ImuMessage(_frame_id(getattr(own, "frame_id", "")), sample)
 
 
-IMU_READING: Reading[ImuSample] = Reading(INERTIAL, _imu)
+IMU_READING: Reading[ImuMessage] = Reading(INERTIAL, _imu)
 _BY_NAME: Readings = {
     "CompressedImage": Reading(IMAGES, _compressed_image),
     "RawImage": Reading(IMAGES, _raw_image),

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from fleetmap.camera import Camera
-from fleetmap.drive import Antenna, Frame, GnssFix, ImuSample, WheelSpeed
+from fleetmap.drive import Antenna, Frame, GnssFix, ImuSample, SensorMounting, WheelSpeed
 from fleetmap.drives.calibrations import camera_of, is_rectified
 from fleetmap.drives.image_codec import Image
 from fleetmap.drives.image_stream import DecodedImage, decoded_images, image_name
@@ -27,7 +27,7 @@ from fleetmap.drives.topic_choice import (
 )
 from fleetmap.drives.topic_reading import first_value, read_values
 from fleetmap.errors import CalibrationError, DriveError
-from fleetmap.geometry import CAM_FROM_BODY
+from fleetmap.geometry import CAM_FROM_BODY, Pose
 
 _log = logging.getLogger(__name__)
 
@@ -148,8 +148,12 @@ class McapDrive:
         Of several topics the one with the highest rate is read.
         """
         topic = choose_imu_topic(self.mcap)
-        samples = read_values(self.mcap, INERTIAL, topic) if topic else iter(())
-        return in_time_order(samples, f"{self.name}: {topic}")
+        messages = read_values(self.mcap, INERTIAL, topic) if topic else iter(())
+        return in_time_order((message.sample for message in messages), f"{self.name}: {topic}")
+
+    def imu_mounting(self) -> SensorMounting | None:
+        """How the IMU is mounted; None without one, or where no static transform tells (then with a warning)."""
+        return self._imu_mounting
 
     def wheel_speeds(self) -> Iterator[WheelSpeed]:
         """Forward speeds in time order; nothing when the recording has none.
@@ -159,6 +163,10 @@ class McapDrive:
         topic = choose_speed_topic(self.mcap)
         messages = read_values(self.mcap, SPEEDS, topic) if topic else iter(())
         return in_time_order((message.speed for message in messages), f"{self.name}: {topic}")
+
+    def wheel_mounting(self) -> SensorMounting | None:
+        """The frame of the speeds; a camera that looks forward is assumed, and warned about, where none tells."""
+        return self._wheel_mounting
 
     @cached_property
     def static_transforms(self) -> StaticTransforms:
@@ -190,6 +198,40 @@ class McapDrive:
                 self.name, gnss_frame_id, self.image_frame_id,
             )  # fmt: skip
         return Antenna(np.zeros(3), "assumed at the camera")
+
+    @cached_property
+    def _imu_mounting(self) -> SensorMounting | None:
+        topic = choose_imu_topic(self.mcap)
+        first = next(read_values(self.mcap, INERTIAL, topic), None) if topic else None
+        mounting = self._mounting_of(first.frame_id) if first else None
+        if first and mounting is None:
+            _log.warning(
+                "%s: no static transform connects the IMU's frame '%s' with the camera's '%s'; it is not used",
+                self.name, first.frame_id, self.image_frame_id,
+            )  # fmt: skip
+        return mounting
+
+    @cached_property
+    def _wheel_mounting(self) -> SensorMounting | None:
+        topic = choose_speed_topic(self.mcap)
+        if topic is None:
+            return None
+        frame_id = first_value(self.mcap, SPEEDS, topic).frame_id
+        mounting = self._mounting_of(frame_id)
+        if mounting is None:
+            _log.warning(
+                "%s: no static transform connects the vehicle's frame '%s' with the camera's '%s'; the camera is"
+                " taken to look forward", self.name, frame_id, self.image_frame_id,
+            )  # fmt: skip
+            return SensorMounting(Pose(CAM_FROM_BODY, np.zeros(3)), "assumed level and forward")
+        return mounting
+
+    def _mounting_of(self, frame_id: str) -> SensorMounting | None:
+        """The mounting of a frame; None where the recording does not say."""
+        if frame_id and frame_id == self.image_frame_id:
+            return SensorMounting(Pose.identity(), "same frame")
+        cam_from_sensor = self.static_transforms.between(self.image_frame_id, frame_id) if frame_id else None
+        return SensorMounting(cam_from_sensor, "static transform") if cam_from_sensor else None
 
     def _recorded_antenna(self, antenna: Antenna) -> Antenna:
         if self._antenna_offset_m is not None:

@@ -95,6 +95,14 @@ class TransformMessage:
 
 
 @dataclass(frozen=True)
+class ImuMessage:
+    """An inertial measurement, and the frame whose axes it is along."""
+
+    frame_id: str
+    sample: ImuSample
+
+
+@dataclass(frozen=True)
 class SpeedMessage:
     """A measured speed, and the frame whose forward axis it is along."""
 
@@ -113,7 +121,7 @@ IMAGES: Kind[ImageMessage] = Kind("images")
 CALIBRATIONS: Kind[CalibrationMessage] = Kind("calibrations")
 FIXES: Kind[FixMessage] = Kind("GNSS fixes")
 TRANSFORMS: Kind[TransformMessage] = Kind("transforms")
-INERTIAL: Kind[ImuSample] = Kind("inertial measurements")
+INERTIAL: Kind[ImuMessage] = Kind("inertial measurements")
 SPEEDS: Kind[SpeedMessage] = Kind("speeds")
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from fleetmap.drive import ImuSample, WheelSpeed
+from fleetmap.drive import WheelSpeed
 from fleetmap.drives.messages import (
     CALIBRATIONS,
     FIXES,
@@ -23,6 +23,7 @@ from fleetmap.drives.messages import (
     CompressedPicture,
     FixMessage,
     ImageMessage,
+    ImuMessage,
     RawPicture,
     Reading,
     Readings,
@@ -101,7 +102,7 @@ def _tf_message(message: Any) -> Iterator[TransformMessage]:
         )
 
 
-def _imu(message: Any) -> Iterator[ImuSample]:
+def _imu(message: Any) -> Iterator[ImuMessage]:
     angular, linear = message.angular_velocity, message.linear_acceleration
     covariances = message.angular_velocity_covariance, message.linear_acceleration_covariance
     if any(float(covariance[0]) == _NOT_MEASURED for covariance in covariances):
@@ -110,7 +111,7 @@ def _imu(message: Any) -> Iterator[ImuSample]:
         stamp_ns_of(message.header), (angular.x, angular.y, angular.z), (linear.x, linear.y, linear.z)
     )
     if sample is not None:
-        yield sample
+        yield ImuMessage(frame_id_of(message.header), sample)
 
 
 def _odometry(message: Any) -> Iterator[SpeedMessage]:

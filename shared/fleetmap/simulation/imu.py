@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.drive import ImuSample
-from fleetmap.geodesy import UtmAnchor, UtmGrid
+from fleetmap.geodesy import UtmAnchor, UtmGrid, normal_gravity_m_s2
 from fleetmap.geometry import Pose
 from fleetmap.simulation.motion import Motion
 
@@ -90,12 +90,6 @@ def imu_samples(
 
 
 def gravity_m_s2(anchor: UtmAnchor) -> float:
-    """Normal gravity of the WGS84 ellipsoid at a site.
-
-    Source: NIMA TR8350.2, "Department of Defense World Geodetic System 1984", 2000, eq. 4-1 and 4-3 (to first
-    order in the height).
-    """
+    """Normal gravity at a site."""
     lat_deg, _, height_m = UtmGrid(anchor.epsg).to_geodetic(anchor.offset_m)
-    sin2 = float(np.sin(np.radians(lat_deg)) ** 2)
-    on_ellipsoid = 9.7803253359 * (1.0 + 0.00193185265241 * sin2) / np.sqrt(1.0 - 0.00669437999014 * sin2)
-    return float(on_ellipsoid * (1.0 - 2.0 * float(height_m) / 6_371_000.0))
+    return normal_gravity_m_s2(float(lat_deg), float(height_m))

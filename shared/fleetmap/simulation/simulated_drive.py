@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.camera import Camera
-from fleetmap.drive import Antenna, Frame, GnssFix, ImuSample, WheelSpeed
+from fleetmap.drive import Antenna, Frame, GnssFix, ImuSample, SensorMounting, WheelSpeed
 from fleetmap.errors import InputError
 from fleetmap.geometry import Pose
 from fleetmap.simulation.depth_camera import DepthErrorModel
@@ -132,11 +132,23 @@ class SimulatedDrive:
             return iter(())
         return imu_samples(self.motion, self.mounting.cam_from_imu, self.sensors.imu, seed=self.seed)
 
+    def imu_mounting(self) -> SensorMounting | None:
+        """How the IMU is mounted; None without one on board."""
+        if self.sensors.imu is None:
+            return None
+        return SensorMounting(self.mounting.cam_from_imu, "static transform")
+
     def wheel_speeds(self) -> Iterator[WheelSpeed]:
         """Forward speeds in time order; none where the wheels are not read."""
         if self.sensors.wheels is None:
             return iter(())
         return wheel_speeds(self.motion, self.mounting.cam_from_vehicle, self.sensors.wheels, seed=self.seed)
+
+    def wheel_mounting(self) -> SensorMounting | None:
+        """The frame of the speeds, under the rear axle; None where the wheels are not read."""
+        if self.sensors.wheels is None:
+            return None
+        return SensorMounting(self.mounting.cam_from_vehicle, "static transform")
 
     def _moment(self, index: int) -> tuple[int, float]:
         stamp_ns = int(self.trajectory.stamps_ns[index])
