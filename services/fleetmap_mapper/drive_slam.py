@@ -8,9 +8,9 @@ from collections.abc import Iterable, Iterator
 from fleetmap.camera import Camera
 from fleetmap.drive import Frame
 from fleetmap.errors import DriveError
+from fleetmap.read_ahead import read_ahead
 from fleetmap.vision.features import FeatureExtractor, FeatureSettings
 from fleetmap_mapper.image_mask import ImageMask
-from fleetmap_mapper.read_ahead import read_ahead
 from fleetmap_mapper.settings import MapperSettings
 from fleetmap_mapper.slam import OnKeyframe, Segment, Slam, Unposed
 from fleetmap_mapper.stage_times import StageTimes

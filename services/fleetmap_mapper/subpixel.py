@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 
 from fleetmap.camera import Camera
 from fleetmap.drive import Frame
+from fleetmap.read_ahead import read_ahead
 from fleetmap.vision.patch_alignment import PATCH_PX, Patches, align_patches, sample_patches
 from fleetmap.vision.pyramid import image_pyramid
 from fleetmap_mapper.growing_map import SCALE_FACTOR
 from fleetmap_mapper.placed_map import PlacedMap
-from fleetmap_mapper.read_ahead import read_ahead
 
 Array = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from fleetmap_mapper.read_ahead import read_ahead
+from fleetmap.read_ahead import read_ahead
 
 
 def test_the_items_come_in_their_order():
