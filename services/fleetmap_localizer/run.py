@@ -2,28 +2,49 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+import re
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fleetmap.camera import Camera
 from fleetmap.covariances import PoseCovariances
 from fleetmap.drive import Frame
-from fleetmap.errors import NoPoseError
+from fleetmap.errors import FleetmapError, NoPoseError
 from fleetmap.trajectory import Trajectory
 from fleetmap_localizer.localizer import Localizer
 from fleetmap_localizer.map_supply import MapSupply
-from fleetmap_localizer.pose_estimate import PoseEstimate
+from fleetmap_localizer.pose_estimate import NoPose, PoseEstimate
+from fleetmap_localizer.pose_files.tum_file import trajectory_of
 from fleetmap_localizer.settings import LocalizerSettings
+
+DROPPED = "dropped: the image before was still being worked on"
 
 
 @dataclass(frozen=True)
 class LocalizedDrive:
-    """The poses of a drive and the map they refer to."""
+    """What came of the images of a drive."""
 
-    frame_count: int
-    poses: tuple[PoseEstimate, ...]  # one at least
+    answers: tuple[PoseEstimate | NoPose, ...]  # one an image, in time order
+    map_ids: tuple[str, ...] = ()  # of all maps that were looked into
+    ended_by: BaseException | None = None  # what ended the run before the drive was over
+
+    @property
+    def frame_count(self) -> int:
+        """Images looked at, or dropped."""
+        return len(self.answers)
+
+    @property
+    def poses(self) -> tuple[PoseEstimate, ...]:
+        """The poses that were measured."""
+        return self._of_kind("measured")
+
+    @property
+    def predicted(self) -> tuple[PoseEstimate, ...]:
+        """The poses that were carried on by other sensors than the camera."""
+        return self._of_kind("predicted")
 
     @property
     def map_versions(self) -> tuple[tuple[str, str], ...]:
@@ -32,23 +53,51 @@ class LocalizedDrive:
 
     @property
     def median_inliers(self) -> int:
-        """Landmarks that agreed with a pose, in the median."""
+        """Landmarks that agreed with a measured pose, in the median."""
         return int(np.median([pose.inlier_count for pose in self.poses]))
 
-    def trajectory(self) -> Trajectory:
-        """The poses as a trajectory."""
-        return Trajectory(
-            epsg=self.poses[0].epsg,
-            stamps_ns=np.array([pose.stamp_ns for pose in self.poses], dtype=np.int64),
-            positions_m=np.array([pose.utm_from_cam.translation_m for pose in self.poses]),
-            rotations=np.array([pose.utm_from_cam.rotation for pose in self.poses]),
+    @property
+    def reasons(self) -> Counter[str]:
+        """Why images have no pose, and how many; what differs from image to image is left out."""
+        absent = (answer.reason for answer in self.answers if isinstance(answer, NoPose))
+        return Counter(re.sub(r" *\([^)]*\)", "", reason) for reason in absent)
+
+    def trajectory(self, *, with_predicted: bool = False) -> Trajectory:
+        """The poses, one at least, as a trajectory."""
+        return trajectory_of(self._chosen(with_predicted))
+
+    def covariances(self, *, with_predicted: bool = False) -> PoseCovariances:
+        """The covariances of the same poses."""
+        poses = self._chosen(with_predicted)
+        return PoseCovariances(
+            stamps_ns=np.array([pose.stamp_ns for pose in poses], dtype=np.int64),
+            matrices=np.array([pose.covariance for pose in poses]),
         )
 
-    def covariances(self) -> PoseCovariances:
-        """The covariances of the poses, relative to the map."""
-        return PoseCovariances(
-            stamps_ns=np.array([pose.stamp_ns for pose in self.poses], dtype=np.int64),
-            matrices=np.array([pose.covariance for pose in self.poses]),
+    def with_dropped(self, stamps_ns: Sequence[int]) -> LocalizedDrive:
+        """The same, with images that nobody looked at."""
+        dropped = [NoPose(stamp_ns, DROPPED) for stamp_ns in stamps_ns]
+        return replace(self, answers=tuple(sorted([*self.answers, *dropped], key=lambda each: each.stamp_ns)))
+
+    def _chosen(self, with_predicted: bool) -> Sequence[PoseEstimate]:
+        if not with_predicted:
+            return self.poses
+        return [answer for answer in self.answers if isinstance(answer, PoseEstimate)]
+
+    def _of_kind(self, kind: str) -> tuple[PoseEstimate, ...]:
+        return tuple(each for each in self.answers if isinstance(each, PoseEstimate) and each.kind == kind)
+
+    def require_pose(self) -> None:
+        """Raise what ended the run early if there is no pose, or NoPoseError if it simply found none."""
+        if self.poses:
+            return
+        if self.ended_by is not None:
+            raise self.ended_by
+        names = ", ".join(f"'{map_id}'" for map_id in self.map_ids[:3])
+        why = "".join(f" ({reason})" for reason, _ in self.reasons.most_common(1))
+        raise NoPoseError(
+            f"not one of {self.frame_count} images could be localised in {names or 'any map'}{why}; "
+            "was this road mapped, and is the camera's calibration right?"
         )
 
 
@@ -57,27 +106,35 @@ def localize_drive(
     camera: Camera,
     supply: MapSupply,
     settings: LocalizerSettings | None = None,
+    *,
+    independent: bool = False,
 ) -> LocalizedDrive:
     """Localise every image of a drive in the maps that lie around it.
 
-    Raises:
-        NoPoseError: not one frame could be localised.
-        CalibrationError: images of another size than the camera's calibration.
+    What ends the run early, be it Ctrl-C, a damaged recording or the server, is kept beside the answers so far.
+
+    Args:
+        frames: the images in time order.
+        camera: that took them.
+        supply: of maps.
+        settings: of the localizer.
+        independent: every image is a query on its own, of which not even the supply learns.
     """
     localizer = Localizer(camera, (), settings)
-    poses: list[PoseEstimate] = []
-    frame_count = 0
-    for frame in frames:
-        frame_count += 1
-        localizer.use(supply.views())
-        answer = localizer.localize(frame)
-        supply.moved(answer)
-        if isinstance(answer, PoseEstimate):
-            poses.append(answer)
-    if not poses:
-        names = ", ".join(sorted({f"'{view.map_id}'" for view in supply.views()})[:3])
-        raise NoPoseError(
-            f"not one of {frame_count} images could be localised in {names or 'any map'}; "
-            "was this road mapped, and is the camera's calibration right?"
-        )
-    return LocalizedDrive(frame_count, tuple(poses))
+    answers: list[PoseEstimate | NoPose] = []
+    map_ids: dict[str, None] = {}
+    ended_by: BaseException | None = None
+    try:
+        supply.views()  # waits for the first map, so that no image that is due has to
+        for frame in frames:
+            views = supply.views()
+            map_ids.update((view.map_id, None) for view in views)
+            localizer.use(views)
+            if independent:
+                localizer.forget()
+            answers.append(localizer.localize(frame))
+            if not independent:
+                supply.moved(answers[-1])
+    except (FleetmapError, KeyboardInterrupt) as error:
+        ended_by = error
+    return LocalizedDrive(tuple(answers), tuple(map_ids), ended_by)

@@ -20,7 +20,8 @@ Array = NDArray[np.float64]
 
 _AXES = ("rx", "ry", "rz", "tx", "ty", "tz")
 _ROWS, _COLUMNS = np.triu_indices(6)
-HEADER = ",".join(["stamp_ns", *(f"{_AXES[i]}_{_AXES[j]}" for i, j in zip(_ROWS, _COLUMNS, strict=True))])
+COLUMNS = tuple(f"{_AXES[i]}_{_AXES[j]}" for i, j in zip(_ROWS, _COLUMNS, strict=True))  # of the upper triangle
+HEADER = ",".join(["stamp_ns", *COLUMNS])
 
 
 @dataclass(frozen=True)
@@ -35,8 +36,14 @@ def write_covariances(path: Path, covariances: PoseCovariances) -> None:
     """Write the CSV, replacing the file atomically."""
     lines = [HEADER]
     for stamp_ns, matrix in zip(covariances.stamps_ns.tolist(), covariances.matrices, strict=True):
-        lines.append(f"{stamp_ns}," + ",".join(repr(value) for value in matrix[_ROWS, _COLUMNS].tolist()))
+        lines.append(f"{stamp_ns}," + ",".join(repr(value) for value in upper_triangle(matrix)))
     write_text_atomically(path, "\n".join(lines) + "\n")
+
+
+def upper_triangle(covariance: Array) -> list[float]:
+    """The 21 entries of a covariance (6, 6) that ``COLUMNS`` names."""
+    entries: list[float] = covariance[_ROWS, _COLUMNS].tolist()
+    return entries
 
 
 def read_covariances(path: Path) -> PoseCovariances:

@@ -1,4 +1,4 @@
-"""``fleetmap localize``: read a vehicle's UTM pose from its camera, in a map from a server or a folder."""
+"""``fleetmap localize``: read a vehicle's UTM pose from its camera, in maps from a server or a folder."""
 
 from __future__ import annotations
 
@@ -10,21 +10,25 @@ from pathlib import Path
 import click
 from tqdm import tqdm
 
-from fleetmap.covariances import write_covariances
-from fleetmap.drive import Drive
+from fleetmap.drive import Drive, Frame
 from fleetmap.drives import open_drive
 from fleetmap.errors import DriveError
-from fleetmap.trajectory import write_trajectory
+from fleetmap.read_ahead import read_ahead
+from fleetmap_cli.demo_processes import interrupted_once
+from fleetmap_cli.localization_report import PoseOutputs, finish
 from fleetmap_cli.options import LAT_LON, ServerAccess, optional_server_options
 from fleetmap_localizer.map_source import fetch_candidates, fetch_map, read_map
 from fleetmap_localizer.map_supply import WholeMaps
 from fleetmap_localizer.map_view import LocalizableMap
+from fleetmap_localizer.paced import PacedFrames
 from fleetmap_localizer.part_cache import PartCache
+from fleetmap_localizer.pose_files import require_pose_file_name
 from fleetmap_localizer.run import localize_drive
 from fleetmap_localizer.settings import LocalizerSettings
 
 _PATH = click.Path(path_type=Path)
 _FILE = click.Path(path_type=Path, dir_okay=False)
+_IMAGES_AHEAD = 8  # decoded before they are due
 
 
 @click.command()
@@ -34,21 +38,41 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
 @click.option(
     "--map", "map_", metavar="ID|FOLDER", help="With --server: the map's id. Without: the folder of a map package."
 )
+@click.option("--trajectory", type=_FILE, metavar="OUT.tum", help="Write the poses here (TUM text, UTM).")
 @click.option(
-    "--trajectory", type=_FILE, required=True, metavar="OUT.tum", help="Write the poses here (TUM text, UTM)."
+    "--output",
+    "outputs",
+    type=_FILE,
+    multiple=True,
+    metavar="OUT.csv|.geojson|.mcap|.tum",
+    help="Write the answers here, as the name's ending says. May be given several times.",
 )
 @click.option(
     "--covariances",
     type=_FILE,
     metavar="OUT.csv",
-    help="Write the poses' covariances, relative to the map, here: stamp_ns and the upper triangle of [rotation "
+    help="Write the covariances of the poses in OUT.tum here: stamp_ns and the upper triangle of [rotation "
     "(rad), translation (m)] in the camera's frame.",
+)
+@click.option(
+    "--with-predicted", is_flag=True, help="Have TUM files hold predicted poses too, which they cannot mark."
 )
 @click.option(
     "--near", type=LAT_LON, help="With --server: choose among the maps within 1 km of here, nearest first."
 )
 @click.option(
     "--use-gnss", is_flag=True, help="Take --near from the recording's first GNSS fix. Otherwise GNSS is not read."
+)
+@click.option(
+    "--independent",
+    is_flag=True,
+    help="Every image is a query on its own: no tracking, nothing learnt from those before. For measuring, and "
+    "for photos that are no drive.",
+)
+@click.option(
+    "--paced",
+    is_flag=True,
+    help="Replay at recorded speed. Images that are late are dropped, not queued; latencies are told at the end.",
 )
 @click.option("--image-topic", metavar="TOPIC", help="Which camera, where the recording holds several.")
 @click.option("--gnss-topic", metavar="TOPIC", help="Which receiver, where --use-gnss finds several.")
@@ -60,50 +84,72 @@ def localize(
     server: ServerAccess,
     vehicle_id: str | None,
     map_: str | None,
-    trajectory: Path,
+    trajectory: Path | None,
+    outputs: tuple[Path, ...],
     covariances: Path | None,
+    with_predicted: bool,
     near: tuple[float, float] | None,
     use_gnss: bool,
+    independent: bool,
+    paced: bool,
     image_topic: str | None,
     gnss_topic: str | None,
     cache: Path | None,
-) -> None:
+) -> int | None:
     """Read the UTM pose of every image of RECORDING from the camera alone.
 
     The map comes from a server (--server; verified and kept in a cache) or from a folder (--map). Without --map
-    and --near every map of the server is tried, newest first, and the first that knows the place is kept.
-    Images that cannot be localised for sure get no line in the trajectory.
+    and --near all maps of the server are looked into. An image that cannot be localised for sure gets no pose, and
+    its reason.
+
+    What is written, whole or not at all, also when the run is interrupted:
+
+    \b
+      .tum      the measured poses, for evo and 'fleetmap evaluate'
+      .csv      a line an image: measured, predicted or none with the reason; latitude, longitude, height,
+                heading, UTM, quaternion, sigmas, map and version, inliers, covariance
+      .geojson  the way driven, broken where poses are missing, and a point a pose (RFC 7946)
+      .mcap     foxglove.LocationFix (/fleetmap/location, covariance to the true east, north and up) and
+                foxglove.PoseInFrame (/fleetmap/pose, frame EPSG:326xx); predicted ones under
+                /fleetmap/predicted
 
     \b
     Examples:
       fleetmap localize second.mcap --server tcp/127.0.0.1:7447 --trajectory second.tum
       fleetmap localize second.mcap --server tcp/127.0.0.1:7447 --near 49.0324,8.3429 --trajectory second.tum
       fleetmap localize second.mcap --map my_map --trajectory second.tum
+      fleetmap localize second.mcap --map my_map --output second.csv --output second.geojson --paced
+      fleetmap localize photos.mcap --map my_map --output photos.csv --independent
     """
     if not server.is_given and map_ is None:
         raise click.UsageError("where is the map? Give --server ENDPOINT, or --map FOLDER")
+    wanted = PoseOutputs(trajectory, covariances, outputs, with_predicted)
+    _require_outputs(wanted)
     drive = open_drive(recording, image_topic=image_topic, gnss_topic=gnss_topic)
-    camera = drive.camera
+    camera, settings = drive.camera, LocalizerSettings()
     if use_gnss and map_ is None and near is None:
         near = _first_fix(drive)
-    with _maps(server, vehicle_id, map_, near, cache) as maps:
-        # disable=None: no bar where stderr is a file or a pipe
-        frames = tqdm(
-            drive.frames(), total=drive.frame_count, unit="image", desc="localize", file=sys.stderr, disable=None
-        )
-        settings = LocalizerSettings()
-        result = localize_drive(frames, camera, WholeMaps(maps, camera, settings), settings)
-    write_trajectory(trajectory, result.trajectory())
-    if covariances is not None:
-        write_covariances(covariances, result.covariances())
-    for map_id, version in result.map_versions:
-        click.echo(f"map:            {map_id} (version {version[:12]})")
-    click.echo(f"frames:         {result.frame_count}")
-    click.echo(f"poses:          {len(result.poses)} ({100.0 * len(result.poses) / result.frame_count:.1f} %)")
-    click.echo(f"median inliers: {result.median_inliers}")
-    click.echo(f"trajectory:     {trajectory}")
-    if covariances is not None:
-        click.echo(f"covariances:    {covariances}")
+    paced_frames = PacedFrames(read_ahead(drive.frames(), _IMAGES_AHEAD)) if paced else None
+    frames = _with_bar(paced_frames or drive.frames(), drive.frame_count)
+    with interrupted_once(), _maps(server, vehicle_id, map_, near, cache) as maps:
+        supply = WholeMaps(maps, camera, settings)
+        result = localize_drive(frames, camera, supply, settings, independent=independent)
+    if paced_frames is not None:
+        result = result.with_dropped(paced_frames.dropped_stamps_ns)
+    return finish(wanted, result, paced_frames, drive.frame_count)
+
+
+def _require_outputs(outputs: PoseOutputs) -> None:
+    """Refuse a run that would write nothing, or what nobody can write."""
+    if outputs.trajectory is None and not outputs.others:
+        raise click.UsageError("where to? Give --trajectory OUT.tum, or --output OUT.csv, .geojson, .mcap or .tum")
+    for path in outputs.others:
+        require_pose_file_name(path)
+
+
+def _with_bar(frames: Iterable[Frame], count: int) -> Iterable[Frame]:
+    # disable=None: no bar where stderr is a file or a pipe
+    return tqdm(frames, total=count, unit="image", desc="localize", file=sys.stderr, disable=None)
 
 
 @contextmanager
