@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from fleetmap.vision.absolute_pose import refine_absolute_pose
 from fleetmap.vision.features import Features
 from fleetmap.vision.matching import match_by_projection
 from fleetmap_localizer.gate import Fit
+from fleetmap_localizer.image_uncertainty import relative_covariance
 from fleetmap_localizer.local_map import Indices
 from fleetmap_localizer.map_view import MapView
 from fleetmap_localizer.settings import FittingSettings
@@ -33,7 +35,7 @@ def fit_around(
         if fit is None:
             return None
         map_from_cam = fit.answer.map_from_cam
-    return fit
+    return None if fit is None else _with_honest_covariance(fit, view, camera)
 
 
 def _fit_once(
@@ -67,3 +69,9 @@ def _fit_once(
     if answer is None:
         return None
     return Fit(answer, landmarks, pixels, features.sigmas_px[seen], predictions.pixels, features.pixels)
+
+
+def _with_honest_covariance(fit: Fit, view: MapView, camera: Camera) -> Fit:
+    """The solver's own covariance takes all landmarks for independent witnesses."""
+    covariance = relative_covariance(fit, view.content.landmarks, camera)
+    return replace(fit, answer=replace(fit.answer, covariance=covariance))

@@ -43,6 +43,15 @@ class Pose:
         """Points (..., 3) of the source frame, in the target frame."""
         return points @ self.rotation.T + self.translation_m
 
+    def adjoint(self) -> Array:
+        """Ad (6, 6): ``self @ exp(xi) == exp(Ad xi) @ self`` for tangents xi = [rotation, translation].
+
+        Source: T. Barfoot, "State Estimation for Robotics", 2017, section 7.1.4.
+        """
+        x, y, z = self.translation_m
+        crossed = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ self.rotation
+        return np.block([[self.rotation, np.zeros((3, 3))], [crossed, self.rotation]])
+
 
 @dataclass(frozen=True)
 class Sim3:
