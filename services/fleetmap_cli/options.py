@@ -60,6 +60,7 @@ class Gap(click.ParamType[tuple[float, float]]):
 
 XYZ = Numbers("X,Y,Z")
 LAT_LON = Numbers("LAT,LON")
+QUATERNION = Numbers("QX,QY,QZ,QW")
 
 
 @dataclass(frozen=True)

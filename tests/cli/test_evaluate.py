@@ -89,6 +89,23 @@ def test_a_camera_offset_may_begin_with_a_minus(joined: bool, capsys: pytest.Cap
 
 
 @pytest.mark.usefixtures("files")
+def test_a_known_mounting_is_no_rotation_error(capsys: pytest.CaptureFixture[str]) -> None:
+    half = np.radians(30.0) / 2.0
+    for rotation, expected_deg in (("0,0,0,1", 0.0), (f"0,{np.sin(half)},0,{np.cos(half)}", 30.0)):
+        arguments = ["--against-map", "reference.tum", "--camera-rotation", rotation, "--json"]
+        assert run("second.tum", *arguments) == 0
+        figures = json.loads(capsys.readouterr().out)["against_map"]
+        assert figures["rotation_deg"]["median"] == pytest.approx(expected_deg, abs=1e-4)
+
+
+@pytest.mark.usefixtures("files")
+def test_a_mounting_that_is_no_rotation_is_a_usage_error(capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["--against-map", "reference.tum", "--camera-rotation", "0,0,0.1,0"]
+    assert run("second.tum", *arguments) == 2
+    assert "no unit quaternion" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("files")
 def test_sim3_alignment_takes_a_shift_away_and_reports_the_scale(capsys: pytest.CaptureFixture[str]) -> None:
     assert run("estimate.tum", "reference.tum", "--align", "sim3", "--json") == 0
     figures = json.loads(capsys.readouterr().out)["reference"]

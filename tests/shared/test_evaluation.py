@@ -296,6 +296,10 @@ def test_a_second_camera_is_expected_at_its_offset_from_the_survey_camera() -> N
     assert errors.rotation is not None
     assert errors.rotation.offset_deg == pytest.approx(np.degrees(np.linalg.norm(so3_log(mounting))), abs=0.01)
     assert errors.rotation.spread_deg.max() < 0.1
+    known = evaluate_against_map(query, survey, offset_m, mounting)
+    assert known.rotation is not None
+    assert known.rotation.angles_deg.max() < 0.1
+    assert known.tangents == pytest.approx(errors.tangents, abs=1e-9)
     forgotten = evaluate_against_map(query, survey, np.zeros(3))
     assert forgotten.position_m.median == pytest.approx(np.linalg.norm(offset_m), abs=0.01)
 

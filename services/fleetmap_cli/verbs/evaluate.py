@@ -12,15 +12,20 @@ from typing import Any, cast
 import click
 import numpy as np
 from click.core import ParameterSource
+from numpy.typing import NDArray
 
 from fleetmap.covariances import PoseCovariances, read_covariances
 from fleetmap.errors import InputError
 from fleetmap.evaluation import Alignment, Judgement, evaluate_against_map, evaluate_trajectory, judge
+from fleetmap.geometry import rotations_from_quat_xyzw
 from fleetmap.trajectory import Trajectory, read_trajectory
 from fleetmap_cli.evaluation_report import report
-from fleetmap_cli.options import XYZ
+from fleetmap_cli.options import QUATERNION, XYZ
+
+Array = NDArray[np.float64]
 
 _FILE = click.Path(path_type=Path)
+_UNIT_TOLERANCE = 1e-4
 _OF_REFERENCE = ("align", "spline_through", "compare")  # options that do nothing without REFERENCE.tum
 _OF_RECORDING = ("antenna_offset", "image_topic", "gnss_topic")  # ... without --spline-through
 
@@ -34,6 +39,14 @@ class _Inputs:
     survey: Trajectory | None
     compare: Trajectory | None
     covariances: PoseCovariances | None
+
+
+@dataclass(frozen=True)
+class _CameraPair:
+    """How the estimate's camera sits in the frame of the survey's."""
+
+    offset_m: Array  # (3,)
+    survey_from_query: Array | None  # (3, 3) rotation
 
 
 @click.command()
@@ -50,6 +63,12 @@ class _Inputs:
     type=XYZ,
     help="Centre of the estimate's camera in the survey camera's frame (x right, y down, z forward), in metres; "
     "for two cameras of one vehicle.  [default: 0,0,0]",
+)
+@click.option(
+    "--camera-rotation",
+    type=QUATERNION,
+    help="Rotation of the estimate's camera in the survey camera's frame, as a unit quaternion, so that the "
+    "rotation error holds no mounting.  [default: 0,0,0,1]",
 )
 @click.option(
     "--align",
@@ -102,6 +121,7 @@ def evaluate(
     reference: Path | None,
     against_map: Path | None,
     camera_offset: tuple[float, float, float] | None,
+    camera_rotation: tuple[float, float, float, float] | None,
     align: str,
     window_m: float,
     covariances: Path | None,
@@ -132,6 +152,10 @@ def evaluate(
 
     NEES (--covariances): of consistent poses its mean is 6 (3 for the position alone); above, the covariances
     promise too much. Against a map the constant rotation between the cameras is taken off first.
+
+    Rotation is told whole, and in two parts: the constant one, which may be a mounting or a calibration, and the
+    rest. A map whose camera was calibrated anew (map --refine-calibration) has turned that camera's axis with its
+    image centre; --camera-rotation has to hold that turn as well.
 
     \b
     Examples:
@@ -165,7 +189,8 @@ def evaluate(
         compare=read_trajectory(compare) if compare else None,
         covariances=read_covariances(covariances) if covariances else None,
     )
-    judged = _judge(inputs, cast(Alignment, align), window_m, camera_offset or (0.0, 0.0, 0.0))
+    pair = _CameraPair(np.array(camera_offset or (0.0, 0.0, 0.0)), _rotation(camera_rotation))
+    judged = _judge(inputs, cast(Alignment, align), window_m, pair)
     if spline_through is not None and inputs.reference is not None:
         judged |= _judge_splines(spline_through, inputs.reference, window_m, recording_options)
     if plot is not None:
@@ -176,9 +201,7 @@ def evaluate(
         click.echo("\n\n".join("\n".join(lines) for lines in report(judged)))
 
 
-def _judge(
-    inputs: _Inputs, align: Alignment, window_m: float, camera_offset: tuple[float, float, float]
-) -> dict[str, Judgement]:
+def _judge(inputs: _Inputs, align: Alignment, window_m: float, pair: _CameraPair) -> dict[str, Judgement]:
     """The judgements asked for, under the keys that --json documents."""
     judged: dict[str, Judgement] = {}
     if inputs.reference is not None:
@@ -188,9 +211,17 @@ def _judge(
             others = evaluate_trajectory(inputs.compare, inputs.reference, align=align)
             judged["compare"] = judge(others, window_m=window_m)
     if inputs.survey is not None:
-        errors = evaluate_against_map(inputs.estimate, inputs.survey, np.array(camera_offset))
+        errors = evaluate_against_map(inputs.estimate, inputs.survey, pair.offset_m, pair.survey_from_query)
         judged["against_map"] = judge(errors, window_m=window_m, covariances=inputs.covariances)
     return judged
+
+
+def _rotation(quat_xyzw: tuple[float, float, float, float] | None) -> Array | None:
+    if quat_xyzw is None:
+        return None
+    if abs(float(np.linalg.norm(quat_xyzw)) - 1.0) > _UNIT_TOLERANCE:
+        raise click.UsageError(f"--camera-rotation {','.join(map(str, quat_xyzw))} is no unit quaternion")
+    return rotations_from_quat_xyzw(np.array(quat_xyzw))
 
 
 def _judge_splines(
@@ -237,7 +268,7 @@ def _require_sensible_options(context: click.Context) -> None:
 
     if given["reference"] is None and given["against_map"] is None:
         raise click.UsageError("nothing to judge against: give REFERENCE.tum, --against-map SURVEY.tum, or both")
-    refuse_without("against_map", "--against-map SURVEY.tum", ("camera_offset",))
+    refuse_without("against_map", "--against-map SURVEY.tum", ("camera_offset", "camera_rotation"))
     refuse_without("reference", "REFERENCE.tum to judge against", _OF_REFERENCE)
     refuse_without("spline_through", "--spline-through RECORDING.mcap", _OF_RECORDING)
     refuse_without("plot", "--plot OUT.png to be drawn in", ("landmarks",))

@@ -37,7 +37,7 @@ def write_mcap(path: Path, answers: Sequence[PoseEstimate | NoPose]) -> None:
             for name, message in (("location", _location(pose)), ("pose", _pose(pose))):
                 writer.write_message(f"{prefix}/{name}", message, pose.stamp_ns, pose.stamp_ns)
         writer.add_metadata("fleetmap maps", {pose.map_id: pose.version for pose in poses})
-        writer.finish()
+        writer.finish()  # type: ignore[no-untyped-call]
         file.flush()
         os.fsync(file.fileno())
 

@@ -147,13 +147,16 @@ def evaluate_trajectory(
     )
 
 
-def evaluate_against_map(query: Trajectory, survey: Trajectory, camera_offset_m: Array) -> TrajectoryErrors:
+def evaluate_against_map(
+    query: Trajectory, survey: Trajectory, camera_offset_m: Array, survey_from_query: Array | None = None
+) -> TrajectoryErrors:
     """Errors of a localised camera relative to the trajectory of the map it was localised in.
 
     For two cameras of one vehicle: ``camera_offset_m`` (3,) is the query camera's centre in the survey camera's
-    frame. The survey's pose is interpolated to the query's stamps; what the map itself errs in UTM drops out.
-    The rotations still hold the mounting between the two cameras: it is their mean, so look at the spread; the
-    tangents are taken without it. Coverage counts the query's poses.
+    frame, ``survey_from_query`` (3, 3) its rotation. The survey's pose is interpolated to the query's stamps; what
+    the map itself errs in UTM drops out. Where the rotation is not known, the errors still hold the mounting
+    between the two cameras: it is their mean, so look at the spread. The tangents are always taken without the
+    mean. Coverage counts the query's poses.
 
     Raises:
         TrajectoryError: different UTM zones, or no query pose between two neighbouring survey poses.
@@ -168,7 +171,7 @@ def evaluate_against_map(query: Trajectory, survey: Trajectory, camera_offset_m:
     arms_m = survey_at_query.rotations @ np.asarray(camera_offset_m, dtype=np.float64)
     true_positions_m = survey_at_query.positions_m + arms_m
     rotations = query.rotations[compared]
-    survey_from_query = survey_at_query.rotations.transpose(0, 2, 1) @ rotations
+    turned = survey_at_query.rotations.transpose(0, 2, 1) @ rotations
     along_m = query.positions_m.copy()
     along_m[compared] = true_positions_m
     offsets_m = query.positions_m[compared] - true_positions_m
@@ -178,8 +181,8 @@ def evaluate_against_map(query: Trajectory, survey: Trajectory, camera_offset_m:
         offsets_m=offsets_m,
         road_m=way_driven_m(along_m),
         compared=np.flatnonzero(compared),
-        rotation=RotationErrors.of(survey_from_query),
-        tangents=_tangents(offsets_m, rotations, survey_at_query.rotations @ mean_rotation(survey_from_query)),
+        rotation=RotationErrors.of(turned if survey_from_query is None else survey_from_query.T @ turned),
+        tangents=_tangents(offsets_m, rotations, survey_at_query.rotations @ mean_rotation(turned)),
     )
 
 
