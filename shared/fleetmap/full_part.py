@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from fleetmap.errors import MapPackageError
 from fleetmap.geodesy import UtmAnchor
 from fleetmap.manifest import Manifest
-from fleetmap.parts import decode_part, encode_part
+from fleetmap.parts import Part, decode_part, encode_part
 from fleetmap.visual_map import Keyframes, Landmarks, Observations, VisualMap
 
 # name -> (dtype on disk, group of VisualMap and its length, field, shape of one row)
@@ -31,7 +31,10 @@ _COLUMNS: dict[str, tuple[str, str, str, tuple[int, ...]]] = {
     "observation_pixels": ("<f4", "observations", "pixels", (2,)),
     "observation_octaves": ("|u1", "observations", "octaves", ()),
 }
+_COVARIANCES, _IS_DETERMINED = "keyframe_covariances", "keyframe_is_determined"  # since format 2
+_ROWS, _ROW_ENDS = np.triu_indices(6)
 _ORTHONORMAL_TOLERANCE = 1e-6
+_LEAST_VARIANCE = 1e-30
 MAX_EXTENT_M = 1e6  # from the anchor, along each axis; millimetres from any cell of the map fit an int32
 
 
@@ -41,6 +44,11 @@ def encode_full(visual_map: VisualMap) -> bytes:
         name: np.asarray(getattr(getattr(visual_map, group), field)).astype(dtype, casting="same_kind")
         for name, (dtype, group, field, _) in _COLUMNS.items()
     }
+    covariances = visual_map.keyframes.covariances
+    if covariances is not None:
+        determined = np.asarray(np.isfinite(covariances).all(axis=(1, 2)))
+        arrays[_IS_DETERMINED] = determined.astype("|u1")
+        arrays[_COVARIANCES] = np.where(determined[:, None], covariances[:, _ROWS, _ROW_ENDS], 0.0).astype("<f4")
     return encode_part("full", full_attributes(visual_map.anchor), arrays)
 
 
@@ -62,12 +70,23 @@ def decode_full(data: bytes, manifest: Manifest, origin: str) -> VisualMap:
         anchor,
         manifest.map_from_vis.to_sim3(),
         manifest.camera.to_camera(),
-        Keyframes(**groups["keyframes"]),
+        Keyframes(**groups["keyframes"], covariances=_read_covariances(part)),
         Landmarks(**groups["landmarks"]),
         Observations(**groups["observations"]),
     )
     check_visual_map(visual_map, origin)
     return visual_map
+
+
+def _read_covariances(part: Part) -> NDArray[np.float32] | None:
+    """``Keyframes.covariances``; a map whose writer does not know them has none."""
+    if _COVARIANCES not in part:
+        return None
+    triangles = part.array(_COVARIANCES, "<f4", (None, len(_ROWS)))
+    covariances = np.empty((len(triangles), 6, 6), np.float32)
+    covariances[:, _ROWS, _ROW_ENDS] = covariances[:, _ROW_ENDS, _ROWS] = triangles
+    covariances[part.array(_IS_DETERMINED, "|u1", (len(triangles),)) == 0] = np.nan
+    return covariances
 
 
 def full_attributes(anchor: UtmAnchor) -> dict[str, Any]:
@@ -94,6 +113,7 @@ def check_visual_map(visual_map: VisualMap, origin: str) -> None:
         if (np.abs(points_m) > MAX_EXTENT_M).any():
             raise MapPackageError(f"{origin}: a {what} lies more than 1,000 km from the map's anchor")
     check_rotations(visual_map.keyframes.rotations, origin)
+    check_covariances(visual_map.keyframes.covariances, len(visual_map.keyframes), origin)
     observations = visual_map.observations
     check_indices(observations.keyframe_index, len(visual_map.keyframes), "observed keyframes", origin)
     check_indices(observations.landmark_index, len(visual_map.landmarks), "observed landmarks", origin)
@@ -111,6 +131,19 @@ def check_rotations(rotations: NDArray[np.float64], origin: str) -> None:
     gram = rotations @ rotations.transpose(0, 2, 1)
     if not (np.abs(gram - np.eye(3)) < _ORTHONORMAL_TOLERANCE).all() or (np.linalg.det(rotations) < 0.0).any():
         raise MapPackageError(f"{origin}: keyframe orientations are no rotations")
+
+
+def check_covariances(covariances: NDArray[np.float32] | None, count: int, origin: str) -> None:
+    """Refuse what are no covariances (K, 6, 6) of ``count`` keyframes; those that are NaN are not known."""
+    if covariances is None:
+        return
+    if covariances.shape != (count, 6, 6):
+        raise MapPackageError(f"{origin}: covariances have shape {covariances.shape} instead of {(count, 6, 6)}")
+    known = covariances[~np.isnan(covariances).all(axis=(1, 2))].astype(np.float64)
+    sigmas = np.sqrt(np.diagonal(known, axis1=1, axis2=2).clip(_LEAST_VARIANCE))
+    correlations = known / sigmas[:, :, None] / sigmas[:, None, :]
+    if not np.isfinite(correlations).all() or (len(known) and np.linalg.eigvalsh(correlations).min() < -1e-3):
+        raise MapPackageError(f"{origin}: the covariance of a keyframe is none")
 
 
 def check_indices(indices: NDArray[Any], count: int, what: str, origin: str) -> None:

@@ -3,6 +3,9 @@
 The manifest names its parts by SHA-256; the map's version is the SHA-256 of the manifest's bytes, so one
 hash vouches for everything. Fields of a newer minor version are kept out of the way, a newer major version
 is refused.
+
+Format 2 has lean cells that readers of format 1 cannot read (see fleetmap.cells), and they may hold fewer
+keyframes and landmarks than the map. Maps of format 1 are read as ever.
 """
 
 from __future__ import annotations
@@ -30,7 +33,8 @@ from fleetmap.geodesy import UtmAnchor
 from fleetmap.geometry import Sim3, rotations_from_quat_xyzw
 
 FORMAT_NAME = "fleetmap-map"
-FORMAT_MAJOR, FORMAT_MINOR = 1, 1
+FORMAT_MAJOR, FORMAT_MINOR = 2, 0
+OLDEST_MAJOR = 1  # still read
 CELL_SIZE_M = 128
 MAX_MANIFEST_BYTES = 16 * 1024 * 1024
 MAX_PART_BYTES = 512 * 1024 * 1024
@@ -230,6 +234,14 @@ class Provenance(_Model):
     created_ns: Int64
 
 
+class Localizable(_Model):
+    """What all cells together hold of the map."""
+
+    keyframes: Total
+    landmarks: Total
+    size_bytes: Total  # of the cell parts; a landmark seen from two cells counts in both
+
+
 class Manifest(_Model):
     """The whole of ``manifest.json``."""
 
@@ -243,6 +255,7 @@ class Manifest(_Model):
     parts: tuple[PartRecord, ...] = Field(min_length=1, max_length=MAX_PARTS)
     quality: Quality
     provenance: Provenance
+    localizable: Localizable | None = None  # since format 2; cells of format 1 hold all of the map
 
     @model_validator(mode="after")
     def _parts_are_distinct(self) -> Manifest:
@@ -320,7 +333,8 @@ def _check_format(document: object, origin: str) -> None:
     major = named.get("major")
     if not isinstance(major, int) or major < 1:
         raise MapPackageError(f"manifest of {origin} does not hold at 'format.major': it must be a whole number")
-    if major != FORMAT_MAJOR:
+    if not OLDEST_MAJOR <= major <= FORMAT_MAJOR:
         raise MapPackageError(
-            f"{origin} has map format {str(major)[:20]}, this fleetmap reads {FORMAT_MAJOR}; upgrade fleetmap"
+            f"{origin} has map format {str(major)[:20]}, this fleetmap reads {OLDEST_MAJOR} to {FORMAT_MAJOR}; "
+            "upgrade fleetmap"
         )

@@ -1,9 +1,9 @@
 """A map package: a folder with ``manifest.json`` and content-addressed parts, ``parts/<sha256>.bin``.
 
-There is one part per 128 m UTM cell that holds keyframes (see fleetmap.cells: what a localizer needs), one full
-part (see fleetmap.full_part: everything, for mapping on) and, since format 1.1, a quality part (see
-fleetmap.quality_part: how good the map is along the road). The map's version is the SHA-256 of the
-manifest's bytes.
+There is one part per 128 m UTM cell that holds keyframes (see fleetmap.cells: what a localizer needs, of those
+keyframes and landmarks that were chosen for it), one full part (see fleetmap.full_part: everything, for mapping
+on) and, since format 1.1, a quality part (see fleetmap.quality_part: how good the map is along the road). The
+map's version is the SHA-256 of the manifest's bytes.
 """
 
 from __future__ import annotations
@@ -12,29 +12,26 @@ import hashlib
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
-from fleetmap.cells import decode_cell, encode_cell, merge_cells, split_into_cells
+from fleetmap.cells import decode_cell, merge_cells
 from fleetmap.errors import MapPackageError, OutputExistsError, StorageError
 from fleetmap.files import atomic_path, refuse_existing
-from fleetmap.footprint import bounding_box, keyframes_lonlat, thinned
-from fleetmap.full_part import check_visual_map, decode_full, encode_full
-from fleetmap.geometry import Sim3, quat_xyzw_from_rotations
+from fleetmap.full_part import decode_full
 from fleetmap.manifest import (
     FORMAT_NAME,
     MAX_MANIFEST_BYTES,
-    MAX_PART_BYTES,
     Manifest,
     PartRecord,
     Provenance,
     Quality,
     check_map_id,
-    make_manifest,
     manifest_version,
     parse_manifest,
 )
-from fleetmap.quality_part import decode_quality, encode_quality
+from fleetmap.package_encoding import check_counts, encode_package
+from fleetmap.quality_part import decode_quality
 from fleetmap.road_quality import RoadQuality
 from fleetmap.visual_map import LocalizationMap, VisualMap
 
@@ -124,9 +121,12 @@ def write_package(
     quality: Quality,
     provenance: Provenance,
     road_quality: RoadQuality | None = None,
+    localizable: VisualMap | None = None,
     force: bool = False,
 ) -> Manifest:
     """Write a map as a package. The folder is there whole or not at all; the same map gives the same bytes.
+
+    ``localizable`` is what of the map goes into the cells (see fleetmap.landmark_choice), by default all of it.
 
     Raises:
         OutputExistsError: the folder exists and ``force`` is not given, or what exists is not a map package.
@@ -136,7 +136,9 @@ def write_package(
     check_map_id(map_id)
     target = folder.resolve()
     check_target(target, force)
-    parts, manifest = _encode(visual_map, map_id, quality, provenance, road_quality)
+    parts, manifest = encode_package(
+        visual_map, localizable or visual_map, map_id, quality, provenance, road_quality
+    )
     manifest_bytes = manifest.to_bytes()
     if len(manifest_bytes) > MAX_MANIFEST_BYTES:
         raise MapPackageError(f"manifest of map '{map_id}' exceeds {MAX_MANIFEST_BYTES} bytes; split the drive")
@@ -211,94 +213,24 @@ def verify_package(package: MapPackage) -> None:
     for record in manifest.parts:
         if record.kind not in ("cell", "full", "quality"):
             package.part_bytes(record.sha256)
-    counted = {"keyframes of all cells": len(package.localization_map().keyframes)}
+    merged, told = package.localization_map(), manifest.localizable
+    keyframes = manifest.quality.keyframes if told is None else told.keyframes
+    check_counts(keyframes, {"keyframes of all cells": len(merged.keyframes)}, origin)
+    if told is not None:
+        check_counts(told.landmarks, {"landmarks of all cells": len(merged.landmarks)}, origin)
     visual_map, road_quality = package.visual_map(), package.road_quality()
+    counted = {}
     if road_quality is not None:
-        counted |= {"keyframes of the quality part": len(road_quality.keyframes)}
+        counted["keyframes of the quality part"] = len(road_quality.keyframes)
     full = next(record for record in manifest.parts if record.kind == "full")
     counted |= {"keyframes of the full part": full.keyframes, "keyframes read": len(visual_map.keyframes)}
-    _agree(manifest.quality.keyframes, counted, origin)
-    _agree(
+    check_counts(manifest.quality.keyframes, counted, origin)
+    check_counts(
         manifest.quality.landmarks,
         {"landmarks of the full part": full.landmarks, "landmarks read": len(visual_map.landmarks)},
         origin,
     )
-    _agree(manifest.quality.observations, {"observations read": len(visual_map.observations)}, origin)
-
-
-def _agree(wanted: int, counted: dict[str, int], origin: str) -> None:
-    for what, count in counted.items():
-        if count != wanted:
-            raise MapPackageError(f"{origin} contradicts itself: {count} {what}, its quality record says {wanted}")
-
-
-def _encode(
-    visual_map: VisualMap, map_id: str, quality: Quality, provenance: Provenance, road_quality: RoadQuality | None
-) -> tuple[list[bytes], Manifest]:
-    """All parts, and the manifest that lists them in the same order."""
-    origin = f"map '{map_id}'"
-    check_visual_map(visual_map, origin)
-    keyframes, landmarks = visual_map.keyframes, visual_map.landmarks
-    if len(keyframes) == 0:
-        raise MapPackageError(f"{origin} holds no keyframes")
-    _agree(quality.keyframes, {"keyframes": len(keyframes)}, origin)
-    _agree(quality.landmarks, {"landmarks": len(landmarks)}, origin)
-    _agree(quality.observations, {"observations": len(visual_map.observations)}, origin)
-    if road_quality is not None:
-        _agree(quality.keyframes, {"keyframes along the road": len(road_quality.keyframes)}, origin)
-    parts, records = _encode_parts(visual_map, road_quality)
-    lonlat = keyframes_lonlat(visual_map.anchor, keyframes)
-    fields = {
-        "map_id": map_id,
-        "anchor": asdict(visual_map.anchor),
-        "map_from_vis": _sim3_fields(visual_map.map_from_vis),
-        "camera": asdict(visual_map.camera),
-        "bbox_lonlat": bounding_box(lonlat),
-        "trajectory_lonlat": lonlat[thinned(keyframes.positions_m)].tolist(),
-        "parts": records,
-        "quality": quality,
-        "provenance": provenance,
-    }
-    return parts, make_manifest(fields, origin)
-
-
-def _encode_parts(
-    visual_map: VisualMap, road_quality: RoadQuality | None
-) -> tuple[list[bytes], list[dict[str, object]]]:
-    """Cells in order, the full part, and the quality part where there is one; each with its record."""
-    parts, records = [], []
-    for index, cell in split_into_cells(visual_map).items():
-        parts.append(encode_cell(index, cell, visual_map.anchor))
-        records.append(_record("cell", parts[-1], len(cell.keyframe_ids), len(cell.landmark_ids), index))
-    parts.append(encode_full(visual_map))
-    records.append(_record("full", parts[-1], len(visual_map.keyframes), len(visual_map.landmarks), None))
-    if road_quality is not None:
-        parts.append(encode_quality(road_quality, visual_map.anchor))
-        records.append(_record("quality", parts[-1], len(road_quality.keyframes), 0, None))
-    return parts, records
-
-
-def _record(
-    kind: str, data: bytes, keyframes: int, landmarks: int, cell: tuple[int, int] | None
-) -> dict[str, object]:
-    if len(data) > MAX_PART_BYTES:
-        raise MapPackageError(f"a '{kind}' part of {len(data)} bytes exceeds {MAX_PART_BYTES}; split the drive")
-    return {
-        "kind": kind,
-        "sha256": hashlib.sha256(data).hexdigest(),
-        "size_bytes": len(data),
-        "cell": cell,
-        "keyframes": keyframes,
-        "landmarks": landmarks,
-    }
-
-
-def _sim3_fields(sim3: Sim3) -> dict[str, object]:
-    return {
-        "scale": float(sim3.scale),
-        "quat_xyzw": quat_xyzw_from_rotations(sim3.rotation).tolist(),
-        "translation_m": sim3.translation_m.tolist(),
-    }
+    check_counts(manifest.quality.observations, {"observations read": len(visual_map.observations)}, origin)
 
 
 def _is_package(folder: Path) -> bool:

@@ -73,6 +73,9 @@ class Part:
     _records: dict[str, _ArrayRecord]
     _payload: bytes
 
+    def __contains__(self, name: str) -> bool:
+        return name in self._records
+
     def array(self, name: str, dtype: str, shape: Shape) -> NDArray[Any]:
         """A copy of one array; ``shape`` holds None where any length will do.
 

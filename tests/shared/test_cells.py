@@ -57,17 +57,17 @@ def assert_localizes_like(merged: LocalizationMap, visual_map: VisualMap) -> Non
     observed = np.unique(visual_map.observations.landmark_index)
     assert merged.anchor == visual_map.anchor
     np.testing.assert_array_equal(merged.keyframes.stamps_ns, visual_map.keyframes.stamps_ns)
-    np.testing.assert_allclose(merged.keyframes.positions_m, visual_map.keyframes.positions_m, rtol=0, atol=1e-8)
-    np.testing.assert_allclose(merged.keyframes.rotations, visual_map.keyframes.rotations, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(merged.keyframes.positions_m, visual_map.keyframes.positions_m, rtol=0, atol=5.1e-4)
+    np.testing.assert_allclose(merged.keyframes.rotations, visual_map.keyframes.rotations, rtol=0, atol=1.5e-5)
     landmarks = visual_map.landmarks
     errors_m = np.linalg.norm(merged.landmarks.points_m - landmarks.points_m[observed], axis=1)
     assert 1e-5 < errors_m.max() < 1e-3
     np.testing.assert_array_equal(merged.landmarks.descriptors, landmarks.descriptors[observed])
     np.testing.assert_array_equal(merged.landmarks.octaves, landmarks.octaves[observed])
-    np.testing.assert_allclose(merged.landmarks.distances_m, landmarks.distances_m[observed], rtol=6e-4)
+    np.testing.assert_allclose(merged.landmarks.distances_m, landmarks.distances_m[observed], rtol=0.0205)
     np.testing.assert_allclose(np.linalg.norm(merged.landmarks.normals, axis=1), 1.0, rtol=1e-6)
     turned_rad = np.arccos(np.clip(np.sum(merged.landmarks.normals * landmarks.normals[observed], axis=1), -1, 1))
-    assert np.degrees(turned_rad.max()) < 0.5
+    assert np.degrees(turned_rad.max()) < 1.0
     pairs = set(zip(merged.seen_by_keyframe.tolist(), observed[merged.seen_landmark].tolist(), strict=True))
     observations = visual_map.observations
     assert pairs == set(
@@ -177,6 +177,70 @@ def test_a_keyframe_that_sees_nothing_and_a_landmark_nobody_sees(make_map: MakeM
     assert len(merged.landmarks) < 100
 
 
+def with_precision(visual_map: VisualMap, sigma_m: float = 0.02) -> VisualMap:
+    """The map with covariances that know no direction, at every other keyframe, and landmarks ever less exact."""
+    covariances = np.tile(np.diag([1e-6] * 3 + [sigma_m**2] * 3), (len(visual_map.keyframes), 1, 1))
+    covariances[1::2] = np.nan
+    across_m = np.geomspace(1e-3, 5.0, len(visual_map.landmarks))
+    sigmas_m = np.stack([across_m, across_m * 4.0], axis=1).astype(np.float32)
+    return replace(
+        visual_map,
+        keyframes=replace(visual_map.keyframes, covariances=covariances.astype(np.float32)),
+        landmarks=replace(visual_map.landmarks, sigmas_m=sigmas_m),
+    )
+
+
+def test_precision_comes_back_a_little_too_pessimistic_and_never_too_optimistic(make_map: MakeMap) -> None:
+    visual_map = with_precision(make_map())
+    merged = merge_cells(visual_map.anchor, list(through_bytes(visual_map).values()))
+    observed = np.unique(visual_map.observations.landmark_index)
+    assert merged.landmarks.sigmas_m is not None
+    assert visual_map.landmarks.sigmas_m is not None
+    ratios = merged.landmarks.sigmas_m / visual_map.landmarks.sigmas_m[observed]
+    assert ratios.min() > 0.9999
+    assert 1.05 < ratios.max() < 1.063
+    covariances = merged.keyframes.covariances
+    assert covariances is not None
+    np.testing.assert_array_equal(np.isnan(covariances[:, 0, 0]), np.arange(len(covariances)) % 2 == 1)
+
+
+def test_landmarks_are_rounded_no_more_than_they_are_uncertain_and_alike_in_every_cell(make_map: MakeMap) -> None:
+    visual_map = with_precision(make_map())
+    cells = list(through_bytes(visual_map).values())
+    merged = merge_cells(visual_map.anchor, cells)
+    observed = np.unique(visual_map.observations.landmark_index)
+    assert visual_map.landmarks.sigmas_m is not None
+    across_m = visual_map.landmarks.sigmas_m[observed, 0]
+    rounded_m = np.abs(merged.landmarks.points_m - visual_map.landmarks.points_m[observed]).max(axis=1)
+    assert 0.05 < rounded_m.max() < 0.52  # of half a step of 1,024 mm
+    assert (rounded_m <= across_m / 8.0 * 1.07 + 0.00051).all()
+    shared = 0
+    for one, other in pairwise(cells):
+        _, mine, theirs = np.intersect1d(one.landmark_ids, other.landmark_ids, return_indices=True)
+        np.testing.assert_array_equal(one.landmarks.points_m[mine], other.landmarks.points_m[theirs])
+        shared += len(mine)
+    assert shared > 20
+
+
+def test_landmarks_come_and_go_as_often_as_they_like(make_map: MakeMap) -> None:
+    """Every other keyframe, or at the beginning and the end only: who saw what is not smoothed over."""
+    visual_map = make_map(keyframes=9, landmarks=60, length_m=20.0, observers=9)
+    observations = visual_map.observations
+    keep = (observations.keyframe_index % 2 == 0) | (observations.landmark_index % 3 == 0)
+    observations = type(observations)(*(column[keep] for column in vars(observations).values()))
+    visual_map = replace(visual_map, observations=observations)
+    assert_localizes_like(merge_cells(visual_map.anchor, list(through_bytes(visual_map).values())), visual_map)
+
+
+def test_a_cell_of_an_unknown_layout_asks_for_an_upgrade(make_map: MakeMap, explode: Explode) -> None:
+    visual_map = make_map()
+    (index, cell), *_ = split_into_cells(visual_map).items()
+    header, _ = explode(encode_cell(index, cell, visual_map.anchor))
+    later = encode_part("cell", header["attributes"] | {"layout": 3}, {})
+    with pytest.raises(MapPackageError, match="cell layout that this fleetmap does not know; upgrade fleetmap"):
+        decode_cell(later, record_of(index, cell), visual_map.anchor, "here")
+
+
 def test_two_cells_that_claim_one_keyframe_are_refused(make_map: MakeMap) -> None:
     visual_map = make_map()
     one, *_ = through_bytes(visual_map).values()
@@ -193,9 +257,9 @@ def test_a_cell_of_another_place_zone_or_size_is_refused(make_map: MakeMap) -> N
         decode_cell(data, record.model_copy(update={"cell": (index[0], index[1] + 1)}), visual_map.anchor, "here")
     with pytest.raises(MapPackageError, match="EPSG:32633"):
         decode_cell(data, record, replace(visual_map.anchor, epsg=32633), "here")
-    with pytest.raises(MapPackageError, match="'keyframe_ids'"):
+    with pytest.raises(MapPackageError, match="'keyframe_poses'"):
         decode_cell(data, record.model_copy(update={"keyframes": record.keyframes + 1}), visual_map.anchor, "here")
-    with pytest.raises(MapPackageError, match="'landmark_ids'"):
+    with pytest.raises(MapPackageError, match="'landmark_places'"):
         decode_cell(data, record.model_copy(update={"landmarks": record.landmarks - 1}), visual_map.anchor, "here")
     with pytest.raises(MapPackageError, match="here is not the cell"):
         decode_cell(encode_full(visual_map), record, visual_map.anchor, "here")
@@ -214,28 +278,31 @@ def put(name: str, place: Any, value: object) -> Callable[[Arrays], None]:
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
-        (put("seen_landmark", -1, 10_000), "observed landmarks lie outside"),
-        (put("seen_by_keyframe", -1, 10_000), "observing keyframes lie outside"),
-        (put("seen_by_keyframe", 0, 1), "pairs of keyframe and landmark are not ascending"),
-        (put("keyframe_ids", 0, 2**31 + 5), "keyframe_ids lie outside"),
-        (put("keyframe_ids", 1, 0), "keyframe_ids are not ascending"),
-        (put("landmark_ids", 1, 0), "landmark_ids are not ascending"),
-        (put("keyframe_positions_m", (0, 0), np.nan), "not finite"),
-        (put("keyframe_positions_m", (0, 0), -0.1), "a keyframe lies outside the cell"),
-        (put("keyframe_positions_m", (0, 1), 128.1), "a keyframe lies outside the cell"),
-        (put("keyframe_positions_m", (0, 2), 1e300), "a keyframe lies outside the cell"),
-        (put("keyframe_quat_xyzw", 0, 0.0), "no unit quaternions"),
-        (put("keyframe_quat_xyzw", 0, 1e300), "no unit quaternions"),
-        (put("landmark_distances_m", 0, -1.0), "negative distance"),
-        (put("landmark_distances_m", 0, np.inf), "not finite"),
-        (lambda arrays: arrays.pop("landmark_normals"), "lacks the array 'landmark_normals'"),
-        (lambda arrays: arrays.update(seen_landmark=arrays["seen_landmark"][:-1]), "'seen_landmark'"),
+        (put("runs", (0, 0), 2 * 10_000), "observing keyframes lie outside"),
+        (put("runs", (0, 0), 1), "observing keyframes lie outside"),  # -1
+        (put("runs", (1, -1), 10_000), "observing keyframes lie outside"),
+        (put("runs", 1, 2**31), "more than 16777216 pairs"),
+        (put("landmark_runs", 0, 2), "runs, there are"),
+        (put("landmark_runs", 0, 2**32 - 1), "runs, there are"),
+        (put("keyframe_poses", (0, 0), 2**32 - 1), "keyframe ids lie outside"),
+        (put("keyframe_poses", (0, 1), 0), "keyframe ids are not ascending"),
+        (put("keyframe_poses", (1, 0), 1), "a keyframe lies outside the cell"),  # -1 mm
+        (put("keyframe_poses", (2, 0), 2 * 128_001), "a keyframe lies outside the cell"),
+        (put("keyframe_poses", (3, 0), 2**32 - 2), "a keyframe lies outside the cell"),
+        (put("keyframe_poses", (slice(4, 8), 0), 0), "no unit quaternions"),
+        (put("keyframe_poses", (4, 0), 2**32 - 1), "no unit quaternions"),
+        (put("landmark_places", (0, 0), 2**32 - 2), "landmark ids lie outside"),
+        (put("landmark_places", (0, 1), 0), "landmark ids are not ascending"),
+        (lambda arrays: arrays.pop("landmark_looks"), "lacks the array 'landmark_looks'"),
+        (lambda arrays: arrays.update(landmark_runs=arrays["landmark_runs"][:-1]), "'landmark_runs'"),
+        (lambda arrays: arrays.update(runs=arrays["runs"][:, :-1]), "runs, there are"),
+        (put("keyframe_covariances", (slice(6, 21), 0), [127] * 5 + [129] * 10), "the covariance of a keyframe is none"),
     ],
 )
 def test_a_cell_that_contradicts_itself_is_refused(
     make_map: MakeMap, explode: Explode, change: Callable[[Arrays], None], complaint: str
 ) -> None:
-    visual_map = make_map()
+    visual_map = with_precision(make_map())
     (index, cell), *_ = split_into_cells(visual_map).items()
     header, payload = explode(encode_cell(index, cell, visual_map.anchor))
     arrays = {item["name"]: values(item, payload) for item in header["arrays"]}

@@ -69,6 +69,9 @@ def assert_equal_maps(read: VisualMap, written: VisualMap) -> None:
     for group in ("keyframes", "landmarks", "observations"):
         for field in fields(getattr(written, group)):
             ours, theirs = getattr(getattr(read, group), field.name), getattr(getattr(written, group), field.name)
+            if theirs is None:
+                assert ours is None
+                continue
             assert ours.dtype == theirs.dtype
             np.testing.assert_array_equal(ours, theirs)
 
