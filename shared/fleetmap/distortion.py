@@ -31,6 +31,7 @@ _NEWTON_TOLERANCE = 1e-13
 _LARGEST_RESIDUAL = 1e-7  # normalised; a ten-thousandth of a pixel: what did not converge has no inverse
 _STEEPEST_TAN = 30.0  # tan of 88 degrees off axis: no perspective camera images more
 _WIDEST_RAD = np.pi
+_POWERS = np.array([3.0, 2.0, 1.0])  # of r^2 in the radial polynomials, but for the constant
 
 
 def is_distorting(model: DistortionModel, coefficients: Coefficients) -> bool:
@@ -42,9 +43,10 @@ def distort(model: DistortionModel, coefficients: Coefficients, ideal: Array) ->
     """Where a lens images normalised points (N, 2) of an ideal camera; NaN where it images nothing."""
     if model == "equidistant":
         return _distort_equidistant(coefficients, ideal)
-    r2 = np.einsum("ni,ni->n", ideal, ideal)
-    distorted, _ = _brown_conrady(coefficients, ideal, with_derivatives=False)
-    return np.where((r2 < _turning_radius(coefficients) ** 2)[:, None], distorted, np.nan)
+    x, y = np.ascontiguousarray(ideal.T)
+    distorted, _ = _brown_conrady(coefficients, x, y, with_derivatives=False)
+    imaged = x * x + y * y < _turning_radius(coefficients) ** 2
+    return np.where(imaged[:, None], np.stack(distorted, axis=1), np.nan)
 
 
 def undistort(model: DistortionModel, coefficients: Coefficients, distorted: Array) -> Array:
@@ -54,27 +56,28 @@ def undistort(model: DistortionModel, coefficients: Coefficients, distorted: Arr
     """
     if model == "equidistant":
         return _undistort_equidistant(coefficients, distorted)
-    ideal = distorted.copy()
     reach = _turning_radius(coefficients)
+    x_seen, y_seen = np.ascontiguousarray(distorted.T)
+    x, y = x_seen, y_seen
     for _ in range(_NEWTON_STEPS):
-        guess, (xx, xy, yx, yy) = _brown_conrady(coefficients, ideal, with_derivatives=True)
-        miss = distorted - guess
-        determinant = xx * yy - xy * yx
+        (x_guess, y_guess), (xx, xy, yx, yy) = _brown_conrady(coefficients, x, y, with_derivatives=True)
+        x_miss, y_miss = x_seen - x_guess, y_seen - y_guess
         with np.errstate(divide="ignore", invalid="ignore"):
-            step = np.stack([yy * miss[:, 0] - xy * miss[:, 1], xx * miss[:, 1] - yx * miss[:, 0]], axis=1)
-            ideal = _within(ideal + step / determinant[:, None], reach)
-        if np.nanmax(np.abs(miss), initial=0.0) < _NEWTON_TOLERANCE:
+            determinant = xx * yy - xy * yx
+            x_step, y_step = yy * x_miss - xy * y_miss, xx * y_miss - yx * x_miss
+            x, y = _within(x + x_step / determinant, y + y_step / determinant, reach)
+        if max(_largest(x_miss), _largest(y_miss)) < _NEWTON_TOLERANCE:
             break
-    miss = distorted - _brown_conrady(coefficients, ideal, with_derivatives=False)[0]
-    found = np.all(np.abs(miss) <= _LARGEST_RESIDUAL, axis=1)
-    return np.where(found[:, None], ideal, np.nan)
+    (x_guess, y_guess), _ = _brown_conrady(coefficients, x, y, with_derivatives=False)
+    found = (np.abs(x_seen - x_guess) <= _LARGEST_RESIDUAL) & (np.abs(y_seen - y_guess) <= _LARGEST_RESIDUAL)
+    return np.where(found[:, None], np.stack([x, y], axis=1), np.nan)
 
 
 def jacobian(model: DistortionModel, coefficients: Coefficients, ideal: Array) -> Array:
     """d distorted / d ideal (N, 2, 2) at normalised points (N, 2); means nothing where :func:`distort` is NaN."""
     if model == "equidistant":
         return _equidistant_jacobian(coefficients, ideal)
-    _, (xx, xy, yx, yy) = _brown_conrady(coefficients, ideal, with_derivatives=True)
+    _, (xx, xy, yx, yy) = _brown_conrady(coefficients, ideal[:, 0], ideal[:, 1], with_derivatives=True)
     return np.stack([np.stack([xx, xy], axis=1), np.stack([yx, yy], axis=1)], axis=1)
 
 
@@ -99,36 +102,59 @@ def coefficient_jacobian(model: DistortionModel, coefficients: Coefficients, ide
     return np.concatenate(columns, axis=2)
 
 
-def _within(points: Array, reach: float) -> Array:
-    """Points (N, 2) pulled back to where the polynomial still grows: Newton's first step may overshoot."""
-    radius = np.linalg.norm(points, axis=1, keepdims=True)
-    return np.where(radius > reach, points * (reach / np.maximum(radius, 1e-300)), points)
+def _largest(values: Array) -> float:
+    """The largest absolute value, 0 of none; NaN does not count."""
+    return float(np.fmax.reduce(np.abs(values), initial=0.0))
+
+
+def _within(x: Array, y: Array, reach: float) -> tuple[Array, Array]:
+    """Points pulled back to where the polynomial still grows: Newton's first step may overshoot."""
+    radius = np.sqrt(x * x + y * y)
+    if not np.any(radius > reach):
+        return x, y
+    shrink = np.where(radius > reach, reach / np.maximum(radius, 1e-300), 1.0)
+    return x * shrink, y * shrink
 
 
 def _brown_conrady(
-    coefficients: Coefficients, ideal: Array, *, with_derivatives: bool
-) -> tuple[Array, tuple[Array, Array, Array, Array]]:
-    """Distorted points (N, 2) and the Jacobian's entries dx'/dx, dx'/dy, dy'/dx, dy'/dy, each (N,)."""
+    coefficients: Coefficients, x: Array, y: Array, *, with_derivatives: bool
+) -> tuple[tuple[Array, Array], tuple[Array, Array, Array, Array]]:
+    """Distorted points x' and y', and the Jacobian's entries dx'/dx, dx'/dy, dy'/dx, dy'/dy; each (N,)."""
     _, _, p1, p2, *_ = coefficients
-    numerator, denominator = _radial_polynomials(coefficients)
-    x, y = ideal[:, 0], ideal[:, 1]
     r2 = x * x + y * y
-    top, bottom = np.polyval(numerator, r2), np.polyval(denominator, r2)
-    radial = top / bottom
-    distorted = np.stack(
-        [
-            x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
-            y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
-        ],
-        axis=1,
+    radial, slope = _radial(coefficients, r2, with_derivatives=with_derivatives)
+    distorted = (
+        x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
+        y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
     )
     if not with_derivatives:
         return distorted, (x, x, x, x)
-    slope = (np.polyval(np.polyder(numerator), r2) - radial * np.polyval(np.polyder(denominator), r2)) / bottom
     mixed = 2.0 * (x * y * slope + p1 * x + p2 * y)
     xx = radial + 2.0 * x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x
     yy = radial + 2.0 * y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x
     return distorted, (xx, mixed, mixed, yy)
+
+
+def _radial(coefficients: Coefficients, r2: Array, *, with_derivatives: bool) -> tuple[Array, Array]:
+    """The radial factor at r^2 and its slope there, each (N,)."""
+    numerator, denominator = _radial_polynomials(coefficients)
+    top = _polynomial(numerator, r2)
+    slope = _polynomial(numerator[:-1] * _POWERS, r2) if with_derivatives else r2
+    if not np.any(denominator[:-1]):
+        return top, slope
+    bottom = _polynomial(denominator, r2)
+    radial = top / bottom
+    if with_derivatives:
+        slope = (slope - radial * _polynomial(denominator[:-1] * _POWERS, r2)) / bottom
+    return radial, slope
+
+
+def _polynomial(highest_first: Array, at: Array) -> Array:
+    """Horner's rule; numpy.polyval with fewer passes."""
+    value = np.asarray(highest_first[0] * at + highest_first[1])
+    for coefficient in highest_first[2:]:
+        value = value * at + coefficient
+    return value
 
 
 def _radial_polynomials(coefficients: Coefficients) -> tuple[Array, Array]:

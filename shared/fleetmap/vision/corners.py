@@ -17,10 +17,6 @@ from fleetmap.vision.pyramid import GreyImage
 
 IntArray = NDArray[np.int64]
 
-_HALF_CIRCLE = np.array([(0, 3), (1, 3), (2, 2), (3, 1), (3, 0), (3, -1), (2, -2), (1, -3)])
-_CIRCLE = np.concatenate([_HALF_CIRCLE, -_HALF_CIRCLE])  # (16, 2) x, y
-_STRIP_PX = 4096  # pixels that are scored together: their intermediate values stay in the processor's cache
-
 
 @dataclass(frozen=True)
 class Corners:
@@ -35,9 +31,9 @@ class Corners:
 
 def corner_scores(image: GreyImage) -> NDArray[np.uint8]:
     """The score (H, W) uint8 of every pixel of a grey image (H, W); without meaning 3 pixels from its border."""
-    if min(image.shape) < 7:
-        return np.zeros(image.shape, dtype=np.uint8)
-    scores: NDArray[np.uint8] = _scores(np.ascontiguousarray(image), _CIRCLE)
+    scores = np.zeros(image.shape, dtype=np.uint8)
+    if min(image.shape) >= 7:
+        _score_all(image.ravel(), image.shape[1], scores.ravel())
     return scores
 
 
@@ -57,87 +53,75 @@ def spread_evenly(corners: Corners, count: int, cell_px: float) -> IntArray:
 
 
 @njit(cache=True, nogil=True)
-def _scores(image, circle):  # type: ignore[no-untyped-def]
-    """Strip by strip of the flattened image, each step a plain loop that LLVM turns into vector instructions.
+def _score_all(image, width, scores):  # type: ignore[no-untyped-def]
+    """All rows as one, without ends: what reaches over the border has no meaning."""
+    size = len(image) - 6 * width
+    above_3, above_2, above_1 = image[:size], image[width:][:size], image[2 * width :][:size]
+    row = image[3 * width :][:size]
+    below_1, below_2, below_3 = image[4 * width :][:size], image[5 * width :][:size], image[6 * width :]
+    _score_row(above_3, above_2, above_1, row, below_1, below_2, below_3, scores[3 * width + 3 :][: size - 6])
 
-    Of the 16 arcs of nine, two share eight pixels: their minima are those of the eight and of either neighbour.
+
+@njit(cache=True, nogil=True)
+def _score_row(above_3, above_2, above_1, row, below_1, below_2, below_3, scores):  # type: ignore[no-untyped-def]
+    """A plain loop over bytes, which LLVM turns into vector instructions."""
+    for x in range(len(scores)):  # the left border of a window of 7 x 7 pixels
+        a, b, c, d = above_3[x + 3], above_3[x + 4], above_2[x + 5], above_1[x + 6]
+        e, f, g, h = row[x + 6], below_1[x + 6], below_2[x + 5], below_3[x + 4]
+        i, j, k, l = below_3[x + 3], below_3[x + 2], below_2[x + 1], below_1[x]  # noqa: E741
+        m, n, o, p = row[x], above_1[x], above_2[x + 1], above_3[x + 2]
+        floor = _outstanding_arc(_lesser, _greater, a, b, c, d, e, f, g, h, i, j, k, l, m, n, o, p)
+        ceiling = _outstanding_arc(_greater, _lesser, a, b, c, d, e, f, g, h, i, j, k, l, m, n, o, p)
+        centre = row[x + 3]
+        brighter, darker = max(floor, centre) - centre, centre - min(ceiling, centre)
+        scores[x] = max(np.uint8(brighter), np.uint8(darker))
+
+
+@njit(cache=True, nogil=True)
+def _outstanding_arc(least, most, a, b, c, d, e, f, g, h, i, j, k, l, m, n, o, p):  # type: ignore[no-untyped-def]  # noqa: E741
+    """Of the 16 arcs of nine on the circle a..p: the most of what is the least in each of them.
+
+    The least of a row of pixels is named by its ends. Two arcs share eight pixels, and have one of either
+    neighbour more.
     """
-    height, width = image.shape
-    pixels, scores = image.ravel(), np.zeros(height * width, np.uint8)
-    offsets = circle[:, 1] * width + circle[:, 0]
-    lowest, highest = np.empty((2, 8, _STRIP_PX), np.uint8), np.empty((2, 8, _STRIP_PX), np.uint8)
-    floor, ceiling = np.empty(_STRIP_PX, np.uint8), np.empty(_STRIP_PX, np.uint8)
-    start, end = 3 * width + 3, height * width - 3 * width - 3
-    for first in range(start, end, _STRIP_PX):
-        n = min(_STRIP_PX, end - first)
-        for k in range(8):  # of two pixels
-            a, b = first + offsets[2 * k + 1], first + offsets[(2 * k + 2) % 16]
-            _lesser(pixels[a : a + n], pixels[b : b + n], lowest[0, k, :n])
-            _greater(pixels[a : a + n], pixels[b : b + n], highest[0, k, :n])
-        for k in range(8):  # of four
-            _lesser(lowest[0, k], lowest[0, (k + 1) % 8], lowest[1, k, :n])
-            _greater(highest[0, k], highest[0, (k + 1) % 8], highest[1, k, :n])
-        floor[:], ceiling[:] = 0, 255
-        for k in range(8):
-            a, b = first + offsets[2 * k], first + offsets[(2 * k + 9) % 16]
-            ends = pixels[a : a + n], pixels[b : b + n]
-            _raise_floor(lowest[1, k], lowest[1, (k + 2) % 8], ends[0], ends[1], floor[:n])
-            _lower_ceiling(highest[1, k], highest[1, (k + 2) % 8], ends[0], ends[1], ceiling[:n])
-        _largest_contrast(pixels[first : first + n], floor, ceiling, scores[first : first + n])
-    return scores.reshape(height, width)
+    bc, de, fg, hi = least(b, c), least(d, e), least(f, g), least(h, i)
+    jk, lm, no, pa = least(j, k), least(l, m), least(n, o), least(p, a)
+    be, dg, fi, hk = least(bc, de), least(de, fg), least(fg, hi), least(hi, jk)
+    jm, lo, na, pc = least(jk, lm), least(lm, no), least(no, pa), least(pa, bc)
+    first = most(least(least(be, fi), most(a, j)), least(least(dg, hk), most(c, l)))
+    second = most(least(least(fi, jm), most(e, n)), least(least(hk, lo), most(g, p)))
+    third = most(least(least(jm, na), most(i, b)), least(least(lo, pc), most(k, d)))
+    fourth = most(least(least(na, be), most(m, f)), least(least(pc, dg), most(o, h)))
+    return most(most(first, second), most(third, fourth))
 
 
 @njit(cache=True, nogil=True)
-def _lesser(a, b, out):  # type: ignore[no-untyped-def]
-    for n in range(len(out)):
-        out[n] = a[n] if a[n] < b[n] else b[n]
+def _lesser(a, b):  # type: ignore[no-untyped-def]
+    return a if a < b else b
 
 
 @njit(cache=True, nogil=True)
-def _greater(a, b, out):  # type: ignore[no-untyped-def]
-    for n in range(len(out)):
-        out[n] = b[n] if a[n] < b[n] else a[n]
-
-
-@njit(cache=True, nogil=True)
-def _raise_floor(a, b, end_a, end_b, floor):  # type: ignore[no-untyped-def]
-    """The darkest of nine: of eight (a and b), and of the brighter of their neighbours on the circle."""
-    for n in range(len(floor)):
-        eight = a[n] if a[n] < b[n] else b[n]
-        end = end_b[n] if end_a[n] < end_b[n] else end_a[n]
-        nine = eight if eight < end else end
-        floor[n] = nine if floor[n] < nine else floor[n]
-
-
-@njit(cache=True, nogil=True)
-def _lower_ceiling(a, b, end_a, end_b, ceiling):  # type: ignore[no-untyped-def]
-    for n in range(len(ceiling)):
-        eight = b[n] if a[n] < b[n] else a[n]
-        end = end_a[n] if end_a[n] < end_b[n] else end_b[n]
-        nine = end if eight < end else eight
-        ceiling[n] = ceiling[n] if ceiling[n] < nine else nine
-
-
-@njit(cache=True, nogil=True)
-def _largest_contrast(centre, floor, ceiling, out):  # type: ignore[no-untyped-def]
-    for n in range(len(out)):
-        above = floor[n] - centre[n] if floor[n] > centre[n] else 0
-        below = centre[n] - ceiling[n] if ceiling[n] < centre[n] else 0
-        out[n] = np.uint8(above if above > below else below)
+def _greater(a, b):  # type: ignore[no-untyped-def]
+    return b if a < b else a
 
 
 @njit(cache=True, nogil=True)
 def _peaks(scores, threshold, border_px):  # type: ignore[no-untyped-def]
     height, width = scores.shape
     room = max(0, height - 2 * border_px) * max(0, width - 2 * border_px) // 4 + height + width
-    pixels, peaks, row = np.empty((room, 2), np.int32), np.empty(room, np.uint8), np.zeros(width, np.uint8)
+    pixels, peaks = np.empty((room, 2), np.int32), np.empty(room, np.uint8)
+    row = np.zeros((width + 7) // 8 * 8, np.uint8)
+    eights = row.view(np.uint64)
     count = 0
     for y in range(border_px, height - border_px):
-        _peaks_of_row(scores[y - 1], scores[y], scores[y + 1], np.uint8(threshold), row)
-        for x in range(border_px, width - border_px):
-            if row[x] > 0:
-                pixels[count, 0], pixels[count, 1], peaks[count] = x, y, row[x]
-                count += 1
+        _peaks_of_row(scores[y - 1], scores[y], scores[y + 1], np.uint8(threshold), row[:width])
+        for first in range(border_px // 8 * 8, width - border_px, 8):
+            if eights[first // 8] == 0:  # as most are
+                continue
+            for x in range(max(first, border_px), min(first + 8, width - border_px)):
+                if row[x] > 0:
+                    pixels[count, 0], pixels[count, 1], peaks[count] = x, y, row[x]
+                    count += 1
     return pixels[:count].copy(), peaks[:count].copy()
 
 

@@ -1,66 +1,56 @@
-"""Orientation and description of given corners, as ORB does it.
+"""Orientation and description of given corners, as ORB does it; compiled, without an object for every corner.
 
-Source: Rublee, Rabaud, Konolige, Bradski, "ORB: an efficient alternative to SIFT or SURF", ICCV 2011. cv2.ORB
-describes; stored maps hold its descriptors, so the same corner must get the same one for as long as maps live.
+Source: Rublee, Rabaud, Konolige, Bradski, "ORB: an efficient alternative to SIFT or SURF", ICCV 2011. To the last
+bit what cv2.ORB computes: stored maps hold its descriptors, so the same corner must get the same one for as long
+as maps live.
 """
 
 from __future__ import annotations
+
+import math
 
 import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from fleetmap.vision.orb_pattern import pattern_offsets_px
 from fleetmap.vision.pyramid import GreyImage
 
 DESCRIPTOR_BYTES = 32
 BORDER_PX = 19  # what turning a descriptor's pattern may need on each side
-_PATCH_PX = 31  # diameter of the circle that orientation is measured in
+_PATCH_RADIUS_PX = 15  # of the circle that orientation is measured in
+_PATTERN = pattern_offsets_px()
+# Not cv2.GaussianBlur: for bytes it has an arithmetic of its own, which cv2.ORB does not meet.
+_BLUR = cv2.getGaussianKernel(7, 2.0, cv2.CV_32F)
+_DEG = np.float32(np.pi / 180.0)
+_ROUNDER = np.float32(1.5 * 2**23)  # added and taken away again it leaves a float32 whole, half to even
 
 
-class Describer:
-    """Describes corners on every level of one kind of pyramid."""
-
-    def __init__(self, levels: int, scale_factor: float) -> None:
-        self._scales = scale_factor ** np.arange(levels)
-        self._orb = cv2.ORB.create(
-            scaleFactor=scale_factor, nlevels=levels, edgeThreshold=BORDER_PX, patchSize=_PATCH_PX
-        )
-
-    def describe(self, pyramid: list[GreyImage], corners: list[NDArray[np.int32]]) -> NDArray[np.uint8]:
-        """Descriptors (N, 32) of whole pixels (n, 2) of every level, level after level.
-
-        The pixels lie at least BORDER_PX from their level's border.
-        """
-        keypoints = [
-            cv2.KeyPoint(x, y, _PATCH_PX * scale, angle, 0.0, level)
-            for level, (scale, pixels) in enumerate(zip(self._scales.tolist(), corners, strict=True))
-            for (x, y), angle in zip(
-                (pixels * scale).tolist(), orientations_deg(pyramid[level], pixels).tolist(), strict=True
-            )
-        ]
-        if not keypoints:
-            return np.zeros((0, DESCRIPTOR_BYTES), dtype=np.uint8)
-        _, descriptors = self._orb.compute(pyramid[0], keypoints)
-        return np.asarray(descriptors, dtype=np.uint8)
+def describe(image: GreyImage, pixels: NDArray[np.int32]) -> NDArray[np.uint8]:
+    """Descriptors (N, 32) of whole pixels (N, 2) of one level of a pyramid, at least BORDER_PX from its border."""
+    descriptors = np.empty((len(pixels), DESCRIPTOR_BYTES), dtype=np.uint8)
+    if len(pixels) > 0:
+        blurred = cv2.sepFilter2D(image, -1, _BLUR, _BLUR, borderType=cv2.BORDER_REFLECT_101)
+        _describe(blurred.ravel(), image.shape[1], pixels, orientations_deg(image, pixels), _PATTERN, descriptors)
+    return descriptors
 
 
 def orientations_deg(image: GreyImage, pixels: NDArray[np.int32]) -> NDArray[np.float32]:
     """Direction (N,) from x towards y, in [0, 360), in which the circle about each pixel (N, 2) is brightest.
 
-    To the last bit what cv2.ORB finds: whole moments, and OpenCV's quick arc tangent, which is good to 0.3 deg.
+    Whole moments, and OpenCV's quick arc tangent, which is good to 0.3 deg.
     """
     if len(pixels) == 0:
         return np.zeros(0, dtype=np.float32)
-    moments = _moments(np.ascontiguousarray(image), pixels, _half_widths(_PATCH_PX // 2))
-    angles = cv2.phase(moments[:, :1].copy(), moments[:, 1:].copy(), angleInDegrees=True)
-    return np.asarray(angles, dtype=np.float32).ravel()
+    across, down = _moments(np.ascontiguousarray(image), pixels, _CIRCLE)
+    return np.asarray(cv2.phase(across, down, angleInDegrees=True), dtype=np.float32).ravel()
 
 
-def _half_widths(radius: int) -> NDArray[np.int64]:
-    """Half the width of a filled circle, row by row from its middle (radius + 1,); the same from each side."""
+def _circle_mask(radius: int) -> NDArray[np.uint8]:
+    """A filled circle of 255 in zeros, one column wider than high; as ORB draws it, the same from each side."""
     middle = int(radius * np.sqrt(0.5) + 1.0)
-    half_widths = np.zeros(radius + 1, dtype=np.int64)
+    half_widths = np.zeros(radius + 1, dtype=np.int64)  # row by row from the middle
     half_widths[: middle + 1] = np.rint(np.sqrt(radius**2 - np.arange(middle + 1) ** 2))
     column = 0
     for row in range(radius, int(np.ceil(radius * np.sqrt(0.5))) - 1, -1):
@@ -68,23 +58,58 @@ def _half_widths(radius: int) -> NDArray[np.int64]:
             column += 1
         half_widths[row] = column
         column += 1
-    return half_widths
+    rows, columns = np.arange(-radius, radius + 1), np.arange(-radius, radius + 2)
+    inside = np.abs(columns)[None, :] <= half_widths[np.abs(rows)][:, None]
+    return np.where(inside, np.uint8(255), np.uint8(0))
+
+
+_CIRCLE = _circle_mask(_PATCH_RADIUS_PX)
 
 
 @njit(cache=True, nogil=True)
-def _moments(image, pixels, half_widths):  # type: ignore[no-untyped-def]
-    """First moments (N, 2) float32 of the grey values in the circle about each pixel."""
-    moments = np.empty((len(pixels), 2), np.float32)
-    radius = len(half_widths) - 1
+def _moments(image, pixels, circle):  # type: ignore[no-untyped-def]
+    """First moments (N,) float32 across and down of the grey values in the circle about each pixel.
+
+    Columns are summed first, sixteen at once; no sum of theirs leaves 16 bits (15 * 16 / 2 * 255 = 30600).
+    """
+    radius, columns = len(circle) // 2, circle.shape[1]
+    across, down = np.empty(len(pixels), np.float32), np.empty(len(pixels), np.float32)
+    greys, lean = np.empty(columns, np.int16), np.empty(columns, np.int16)
     for n in range(len(pixels)):
-        across, down = np.int32(0), np.int32(0)
-        for v in range(-radius, radius + 1):
-            row, half = image[pixels[n, 1] + v], half_widths[abs(v)]
-            total = np.int32(0)
-            for u in range(-half, half + 1):
-                grey = np.int32(row[pixels[n, 0] + u])
-                across += np.int32(np.int32(u) * grey)
-                total += grey
-            down += np.int32(v * total)
-        moments[n, 0], moments[n, 1] = across, down
-    return moments
+        x, y = pixels[n, 0] - radius, pixels[n, 1] - radius
+        greys[:], lean[:] = 0, 0
+        for v in range(len(circle)):
+            row, mask = image[y + v, x : x + columns], circle[v]
+            for u in range(columns):
+                grey = np.int16(row[u] & mask[u])
+                greys[u] += grey
+                lean[u] += np.int16((v - radius) * grey)
+        moment_across, moment_down = 0, 0
+        for u in range(columns):
+            moment_across += (u - radius) * greys[u]
+            moment_down += lean[u]
+        across[n], down[n] = moment_across, moment_down
+    return across, down
+
+
+@njit(cache=True, nogil=True)
+def _describe(blurred, width, pixels, angles_deg, pattern, descriptors):  # type: ignore[no-untyped-def]
+    """Compare the pairs of pixels (2, 2, 256) that the pattern names, turned by each corner's angle."""
+    offsets = np.empty((2, pattern.shape[2]), np.int32)
+    for n in range(len(pixels)):
+        cosine, sine = math.cos(angles_deg[n] * _DEG), math.sin(angles_deg[n] * _DEG)
+        for end in range(2):
+            x, y, offset = pattern[end, 0], pattern[end, 1], offsets[end]
+            for pair in range(len(offset)):
+                across, down = x[pair] * cosine - y[pair] * sine, x[pair] * sine + y[pair] * cosine
+                row, column = np.int32((down + _ROUNDER) - _ROUNDER), np.int32((across + _ROUNDER) - _ROUNDER)
+                offset[pair] = row * np.int32(width) + column
+        centre = pixels[n, 1] * width + pixels[n, 0]
+        for byte in range(descriptors.shape[1]):
+            bits = 0
+            for bit in range(8):
+                pair = 8 * byte + bit
+                first = blurred[np.uint64(centre + offsets[0, pair])]
+                second = blurred[np.uint64(centre + offsets[1, pair])]
+                bits |= int(first < second) << bit
+            descriptors[n, byte] = bits

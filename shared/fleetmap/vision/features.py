@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from fleetmap.camera import Camera
 from fleetmap.errors import CalibrationError
 from fleetmap.vision.corners import corner_scores, corners_of, spread_evenly
-from fleetmap.vision.descriptors import BORDER_PX, Describer
+from fleetmap.vision.descriptors import BORDER_PX, describe
 from fleetmap.vision.pyramid import GreyImage, image_from_level_px, image_pyramid
 
 Array = NDArray[np.float64]
@@ -62,7 +62,6 @@ class FeatureExtractor:
     def __init__(self, camera: Camera, settings: FeatureSettings | None = None) -> None:
         self.camera = camera
         self.settings = settings or FeatureSettings()
-        self._describer = Describer(self.settings.levels, self.settings.scale_factor)
 
     def extract(self, image: NDArray[np.uint8]) -> Features:
         """Features of a grey image (H, W) uint8; none in an image without texture.
@@ -73,7 +72,7 @@ class FeatureExtractor:
         self._check_size(image)
         pyramid = image_pyramid(image, self.settings.levels, self.settings.scale_factor)
         chosen = self._chosen_corners(pyramid)
-        descriptors = self._describer.describe(pyramid, chosen)
+        descriptors = np.concatenate([describe(*on_level) for on_level in zip(pyramid, chosen, strict=True)])
         recorded = [
             image_from_level_px(pixels.astype(np.float64), image.shape, level.shape)
             for pixels, level in zip(chosen, pyramid, strict=True)
@@ -110,7 +109,7 @@ class FeatureExtractor:
         """
         with np.errstate(all="ignore"):
             pixels = self.camera.undistort(distorted)
-            back = self.camera.project(self.camera.unproject(distorted))
+            back = self.camera.distort(pixels)
             valid = np.linalg.norm(back - distorted, axis=1) < 0.1
             return pixels, np.asarray(valid & self.camera.is_within_reach(pixels))
 
