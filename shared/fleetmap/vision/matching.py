@@ -18,6 +18,7 @@ Descriptors = NDArray[np.uint8]
 
 _NO_PAIR = 1 << 20  # a Hamming distance that no pair has
 _CELL_PX = 16.0
+_BLOCK = 64  # distances that are looked at together
 
 
 def match_descriptors(
@@ -130,45 +131,67 @@ def nearest_words(words_a, words_b, count):  # type: ignore[no-untyped-def]
     Where b has fewer than ``count``, the last one again.
     """
     nearest = np.empty((len(words_a), count), np.int32)
+    columns, to_all = words_b.T.copy(), np.empty(len(words_b), np.int32)
     distances = np.empty(count, np.int64)
     for i in range(len(words_a)):
+        hamming_to_all(words_a[i], columns, to_all)
         distances[:] = _NO_PAIR
         found = 0
-        for j in range(len(words_b)):
-            distance = hamming(words_a, i, words_b, j)
-            if distance >= distances[count - 1]:
+        for first in range(0, len(to_all), _BLOCK):
+            if _smallest(to_all[first : first + _BLOCK]) >= distances[count - 1]:  # as in most blocks
                 continue
-            slot = min(found, count - 1)
-            while slot > 0 and distances[slot - 1] > distance:
-                distances[slot], nearest[i, slot] = distances[slot - 1], nearest[i, slot - 1]
-                slot -= 1
-            distances[slot], nearest[i, slot] = distance, j
-            found = min(found + 1, count)
+            for j in range(first, min(first + _BLOCK, len(to_all))):
+                distance = to_all[j]
+                if distance >= distances[count - 1]:
+                    continue
+                slot = min(found, count - 1)
+                while slot > 0 and distances[slot - 1] > distance:
+                    distances[slot], nearest[i, slot] = distances[slot - 1], nearest[i, slot - 1]
+                    slot -= 1
+                distances[slot], nearest[i, slot] = distance, j
+                found = min(found + 1, count)
         for slot in range(found, count):
             nearest[i, slot] = nearest[i, found - 1]
     return nearest
 
 
 @njit(cache=True, nogil=True)
+def _smallest(values):  # type: ignore[no-untyped-def]
+    smallest = values[0]
+    for n in range(len(values)):  # over the values themselves LLVM would go one by one
+        smallest = min(smallest, values[n])
+    return smallest
+
+
+@njit(cache=True, nogil=True)
 def _match_all(words_a, words_b, max_distance, ratio, mutual):  # type: ignore[no-untyped-def]
+    """Passes over all of b that LLVM turns into vector instructions, in place of one with branches."""
     count_a, count_b = len(words_a), len(words_b)
-    best_of_b = np.full(count_b, _NO_PAIR, np.int64)
-    a_of_b = np.full(count_b, -1, np.int32)
+    columns, distances = words_b.T.copy(), np.empty(count_b, np.int32)
+    best_of_b, a_of_b = np.full(count_b, _NO_PAIR, np.int32), np.full(count_b, -1, np.int32)
     b_of_a = np.full(count_a, -1, np.int32)
     for i in range(count_a):
-        best, second, chosen = _NO_PAIR, _NO_PAIR, -1
-        for j in range(count_b):
-            distance = hamming(words_a, i, words_b, j)
-            if distance < best:
-                second, best, chosen = best, distance, j
-            elif distance < second:
-                second = distance
-            if distance < best_of_b[j]:
-                best_of_b[j] = distance
-                a_of_b[j] = i
-        if best <= max_distance and best <= ratio * second:
+        hamming_to_all(words_a[i], columns, distances)
+        if mutual:
+            _take_if_closer(np.int32(i), distances, best_of_b, a_of_b)
+        best = _smallest(distances)
+        if best > max_distance:
+            continue
+        chosen = 0
+        while distances[chosen] != best:
+            chosen += 1
+        distances[chosen] = _NO_PAIR
+        if best <= ratio * _smallest(distances):
             b_of_a[i] = chosen
     return index_pairs(b_of_a, a_of_b, mutual)
+
+
+@njit(cache=True, nogil=True)
+def _take_if_closer(i, distances, best_of_b, a_of_b):  # type: ignore[no-untyped-def]
+    for j in range(len(distances)):
+        is_closer = distances[j] < best_of_b[j]
+        best_of_b[j] = distances[j] if is_closer else best_of_b[j]
+        a_of_b[j] = i if is_closer else a_of_b[j]
 
 
 @njit(cache=True, nogil=True)

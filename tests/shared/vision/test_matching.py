@@ -76,6 +76,22 @@ def test_mutual_matching_gives_each_partner_once() -> None:
     assert match_descriptors(a, b, 64, mutual=False).tolist() == [[0, 0], [1, 0]]
 
 
+def test_matches_are_those_of_an_exhaustive_search_also_where_distances_tie() -> None:
+    a = random_descriptors(150, seed=3)
+    b = np.concatenate([flip_bits(a[:90], 60), flip_bits(a[:90], 60, seed=4), a[:5], a[:5]])
+    distances = np.unpackbits(a[:, None] ^ b[None], axis=2).sum(axis=2)
+    b_of_a, a_of_b = distances.argmin(axis=1), distances.argmin(axis=0)
+    best, second = np.sort(distances, axis=1)[:, :2].T
+    for mutual in (True, False):
+        expected = [
+            (i, j)
+            for i, j in enumerate(b_of_a)
+            if best[i] <= 64 and best[i] <= 1.0 * second[i] and (not mutual or a_of_b[j] == i)
+        ]
+        assert len(expected) == 90
+        assert match_descriptors(a, b, 64, ratio=1.0, mutual=mutual).tolist() == [list(pair) for pair in expected]
+
+
 def test_nothing_matches_nothing() -> None:
     none, some = random_descriptors(0), random_descriptors(4)
     assert match_descriptors(none, some, 64).shape == (0, 2)
