@@ -8,8 +8,9 @@ keyframes, and what lens and calibration leave is smooth over the image. So the 
 
 with K an exponentially correlated error field over the image, one value for all landmarks of a cell of a coarse
 grid, and L the landmarks' covariances projected into the image. The two variance components are estimated from the
-residuals of each image, by equating the two quadratic forms r'Wr and r'W K W r with their expectations; the pose
-stays the least-squares one, and its covariance is A^-1 J'W V WJ A^-1 with A = J'WJ, not A^-1.
+residuals of each image, by equating the two quadratic forms r'Wr and r'W K W r with their expectations. What is
+smooth over the image a pose absorbs, and few residuals tell little of it: to s_c its own standard error is added.
+The pose stays the least-squares one, and its covariance is A^-1 J'W V WJ A^-1 with A = J'WJ, not A^-1.
 
 Sources: C. R. Rao, "Estimation of variance and covariance components - MINQUE theory", J. Multivariate Analysis 1,
 1971; for least squares under correlated errors, H. White, "A heteroskedasticity-consistent covariance matrix
@@ -62,7 +63,7 @@ def relative_covariance(fit: Fit, landmarks: Landmarks, camera: Camera) -> Array
     X = seen.J.reshape(-1, 6)
     A = X.T @ X
     A_inverse: Array = np.linalg.inv(A)
-    XLX: Array = np.einsum("nai,nab,nbj->ij", seen.J, seen.L, seen.J)
+    XLX = np.asarray(np.einsum("nai,nab,nbj->ij", seen.J, seen.L, seen.J), dtype=np.float64)
     sums, K = _sum_in_cells(seen), _correlations(camera)
     white, common = _variance_components(seen, sums, K, A_inverse, XLX)
     meat = white * A + common * sums.G.T @ K @ sums.G + XLX
@@ -84,12 +85,14 @@ def _variance_components(
     own = float(np.einsum("naa->", seen.L) - np.einsum("ij,ji->", A_inverse, XLX))
     squares = float((seen.residuals**2).sum()) - own
     correlated = float(sums.residuals @ K @ sums.residuals) - float(np.einsum("ij,ji->", K, ZMLMZ))
-    white, common = np.linalg.solve([[freedom, by_white], [by_white, by_common]], [squares, correlated]).tolist()
+    T = np.array([[freedom, by_white], [by_white, by_common]])
+    white, common = np.linalg.solve(T, [squares, correlated]).tolist()
     if common < 0.0:
         white = squares / freedom
     if white < _LEAST_WHITE:
         white, common = _LEAST_WHITE, (correlated - by_white * _LEAST_WHITE) / by_common
-    return white, max(common, 0.0)
+    doubt = white * float(np.sqrt(2.0 * np.linalg.inv(T)[1, 1]))  # cov(q) = 2 s_w^2 T where s_c is small
+    return white, max(common, 0.0) + doubt
 
 
 def _linearise(fit: Fit, landmarks: Landmarks, camera: Camera) -> _Linearised:
