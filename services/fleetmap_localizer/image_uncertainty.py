@@ -62,7 +62,7 @@ def relative_covariance(fit: Fit, landmarks: Landmarks, camera: Camera) -> Array
     seen = _linearise(fit, landmarks, camera)
     X = seen.J.reshape(-1, 6)
     A = X.T @ X
-    A_inverse: Array = np.linalg.inv(A)
+    A_inverse = np.asarray(np.linalg.inv(A), dtype=np.float64)
     XLX = np.asarray(np.einsum("nai,nab,nbj->ij", seen.J, seen.L, seen.J), dtype=np.float64)
     sums, K = _sum_in_cells(seen), _correlations(camera)
     white, common = _variance_components(seen, sums, K, A_inverse, XLX)
