@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from fleetmap.errors import InputError
 
@@ -18,6 +17,8 @@ Array = NDArray[np.float64]
 
 # A level camera that looks forward: body x forward, y left, z up; cam x right, y down, z forward.
 CAM_FROM_BODY = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+
+_SMALL_RAD = 1e-3  # below it, two terms of the series are exact to rounding
 
 
 @dataclass(frozen=True)
@@ -117,12 +118,21 @@ def nearest_rotations(matrices: Array) -> Array:
 
 def so3_exp(rotation_vectors_rad: Array) -> Array:
     """Rotation matrices (..., 3, 3) of rotation vectors (..., 3)."""
-    return np.asarray(Rotation.from_rotvec(rotation_vectors_rad).as_matrix(), dtype=np.float64)
+    vectors = np.asarray(rotation_vectors_rad, dtype=np.float64)
+    angles = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    is_small = angles < _SMALL_RAD
+    per_rad = np.where(is_small, 0.5 - angles**2 / 48.0, np.sin(angles / 2.0) / np.where(is_small, 1.0, angles))
+    return rotations_from_quat_xyzw(np.concatenate([per_rad * vectors, np.cos(angles / 2.0)], axis=-1))
 
 
 def so3_log(rotations: Array) -> Array:
     """Rotation vectors (..., 3) in rad of rotation matrices (..., 3, 3)."""
-    return np.asarray(Rotation.from_matrix(rotations).as_rotvec(), dtype=np.float64)
+    quat_xyzw = quat_xyzw_from_rotations(rotations)
+    sines = np.linalg.norm(quat_xyzw[..., :3], axis=-1, keepdims=True)
+    is_small = sines < _SMALL_RAD
+    angles = 2.0 * np.arctan2(sines, quat_xyzw[..., 3:])
+    rad_per = np.where(is_small, 2.0 + sines**2 / 3.0, angles / np.where(is_small, 1.0, sines))
+    return np.asarray(rad_per * quat_xyzw[..., :3])
 
 
 def rotation_angle_rad(rotations: Array) -> Array:
@@ -131,13 +141,47 @@ def rotation_angle_rad(rotations: Array) -> Array:
 
 
 def rotations_from_quat_xyzw(quat_xyzw: Array) -> Array:
-    """Rotation matrices (..., 3, 3) of quaternions (..., 4) in the order x, y, z, w."""
-    return np.asarray(Rotation.from_quat(quat_xyzw).as_matrix(), dtype=np.float64)
+    """Rotation matrices (..., 3, 3) of quaternions (..., 4) in the order x, y, z, w, of any length but zero.
+
+    Raises:
+        InputError: one has no length.
+    """
+    quat = np.asarray(quat_xyzw, dtype=np.float64)
+    lengths = np.linalg.norm(quat, axis=-1, keepdims=True)
+    if not np.all(lengths > 0.0):
+        raise InputError("a quaternion of length zero turns nothing anywhere")
+    x, y, z, w = np.moveaxis(quat / lengths, -1, 0)
+    elements = [
+        [x * x - y * y - z * z + w * w, 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)],
+        [2.0 * (x * y + z * w), -x * x + y * y - z * z + w * w, 2.0 * (y * z - x * w)],
+        [2.0 * (x * z - y * w), 2.0 * (y * z + x * w), -x * x - y * y + z * z + w * w],
+    ]
+    return np.moveaxis(np.array(elements), (0, 1), (-2, -1))
 
 
 def quat_xyzw_from_rotations(rotations: Array) -> Array:
-    """Quaternions (..., 4) in the order x, y, z, w with w >= 0, of rotation matrices (..., 3, 3)."""
-    return np.asarray(Rotation.from_matrix(rotations).as_quat(canonical=True), dtype=np.float64)
+    """Quaternions (..., 4) in the order x, y, z, w with w >= 0, of rotation matrices (..., 3, 3).
+
+    4 q q^T follows from the matrix without a root; its row with the largest square has the least rounding error.
+    Source: S. W. Shepperd, "Quaternion from rotation matrix", J. Guidance and Control 1(3), 1978.
+    """
+    R = np.moveaxis(np.asarray(rotations, dtype=np.float64), (-2, -1), (0, 1))
+    xx, yy, zz = R[0, 0], R[1, 1], R[2, 2]
+    xy, xz, yz = R[1, 0] + R[0, 1], R[0, 2] + R[2, 0], R[2, 1] + R[1, 2]
+    xw, yw, zw = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+    rows = np.array(
+        [
+            [1.0 + xx - yy - zz, xy, xz, xw],
+            [xy, 1.0 - xx + yy - zz, yz, yw],
+            [xz, yz, 1.0 - xx - yy + zz, zw],
+            [xw, yw, zw, 1.0 + xx + yy + zz],
+        ]
+    )
+    rows = np.moveaxis(rows, (0, 1), (-2, -1))
+    squares = np.diagonal(rows, axis1=-2, axis2=-1)
+    quat = np.take_along_axis(rows, np.argmax(squares, axis=-1)[..., None, None], axis=-2)[..., 0, :]
+    quat = quat / np.linalg.norm(quat, axis=-1, keepdims=True)
+    return np.asarray(np.where(quat[..., 3:] < 0.0, -quat, quat))
 
 
 def interpolate_pose(first: Pose, second: Pose, fraction: float) -> Pose:

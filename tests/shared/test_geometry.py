@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from fleetmap.errors import InputError
 from fleetmap.geometry import (
@@ -140,6 +141,25 @@ def test_rotations_and_quaternions_are_inverses(vector):
     quat = quat_xyzw_from_rotations(rotation)
     assert quat[3] >= 0.0
     assert np.allclose(rotations_from_quat_xyzw(quat), rotation, atol=1e-12)
+
+
+@pytest.mark.parametrize("angle_rad", [0.0, 1e-300, 1e-12, 9.99e-4, 1.01e-3, 1.0, np.pi - 1e-3, np.pi - 1e-12])
+def test_rotations_of_every_size_about_every_axis_are_those_of_scipy(angle_rad):
+    axes = np.random.default_rng(1).normal(size=(200, 3))
+    vectors = angle_rad * np.vstack([np.eye(3), -np.eye(3), axes / np.linalg.norm(axes, axis=1, keepdims=True)])
+    expected = Rotation.from_rotvec(vectors)
+    rotations = so3_exp(vectors)
+    assert np.abs(rotations - expected.as_matrix()).max() < 1e-15
+    assert np.allclose(so3_log(rotations), expected.as_rotvec(), rtol=1e-9, atol=1e-15)
+    assert np.abs(quat_xyzw_from_rotations(rotations) - expected.as_quat(canonical=True)).max() < 1e-15
+    assert np.abs(rotations_from_quat_xyzw(-3.0 * expected.as_quat()) - expected.as_matrix()).max() < 2e-15
+
+
+def test_half_a_turn_has_an_angle_and_a_quaternion_without_length_is_refused():
+    assert rotation_angle_rad(np.diag([1.0, -1.0, -1.0])) == pytest.approx(np.pi)
+    assert np.abs(so3_log(np.diag([-1.0, -1.0, 1.0]))) == pytest.approx([0.0, 0.0, np.pi])
+    with pytest.raises(InputError, match="quaternion"):
+        rotations_from_quat_xyzw(np.zeros((2, 4)))
 
 
 def test_quaternions_are_in_the_order_x_y_z_w():
