@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from fleetmap.errors import InputError
 from fleetmap_localizer.pose_estimate import NoPose, PoseEstimate
-from fleetmap_localizer.pose_files.csv_file import write_csv
-from fleetmap_localizer.pose_files.geojson_file import write_geojson
-from fleetmap_localizer.pose_files.mcap_file import write_mcap
-from fleetmap_localizer.pose_files.tum_file import write_tum
 
-_WRITERS: dict[str, Callable[[Path, Sequence[PoseEstimate | NoPose]], None]] = {
-    ".tum": write_tum,
-    ".csv": write_csv,
-    ".geojson": write_geojson,
-    ".mcap": write_mcap,
+_Writer = Callable[[Path, Sequence[PoseEstimate | NoPose]], None]
+
+# Imported when a file is written: a vehicle that starts should not wait for what others' formats need.
+_WRITERS = {
+    ".tum": "tum_file:write_tum",
+    ".csv": "csv_file:write_csv",
+    ".geojson": "geojson_file:write_geojson",
+    ".mcap": "mcap_file:write_mcap",
 }
 
 
@@ -44,5 +44,11 @@ def write_pose_file(
         answers = [each for each in answers if isinstance(each, PoseEstimate) and each.kind == "measured"]
     if suffix != ".csv" and not any(isinstance(each, PoseEstimate) for each in answers):
         return False
-    _WRITERS[suffix](path, answers)
+    _writer(suffix)(path, answers)
     return True
+
+
+def _writer(suffix: str) -> _Writer:
+    module, name = _WRITERS[suffix].split(":")
+    writer: _Writer = getattr(importlib.import_module(f"{__name__}.{module}"), name)
+    return writer
