@@ -13,6 +13,7 @@ from fleetmap import __version__
 from fleetmap.drives import open_drive
 from fleetmap.drives.opening import find_mcap
 from fleetmap.errors import InputError
+from fleetmap.landmark_choice import localizable_part
 from fleetmap.manifest import Manifest, Provenance, check_map_id
 from fleetmap.map_package import check_target, open_package, write_package
 from fleetmap.naming import map_id_from
@@ -85,6 +86,7 @@ def map_recording(
         quality=mapped.quality,
         provenance=provenance,
         road_quality=mapped.road_quality,
+        localizable=localizable_part(mapped.visual_map, settings.cells.budget_mb_per_km),
         force=force,
     )
     if trajectory is not None:

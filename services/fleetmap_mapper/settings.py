@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 CalibrationMode = Literal["recorded", "auto", "refined"]
+LEAST_BUDGET_MB_PER_KM = 0.05
 GnssMode = Literal["none", "mapping", "final", "full"]
 
 
@@ -110,6 +111,19 @@ class QualityGroup(_Group):
     weak_ties: int = Field(default=20, ge=0)  # landmarks seen from both before and after a place
 
 
+class CellGroup(_Group):
+    """What of the map goes into the cells that localizers fetch; the whole of it stays in the full part."""
+
+    budget_mb_per_km: float = Field(default=1.0, ge=0.0)  # of all cells, on the keyframes' way; 0 keeps everything
+
+    @field_validator("budget_mb_per_km")
+    @classmethod
+    def _has_room_for_keyframes(cls, budget_mb_per_km: float) -> float:
+        if 0.0 < budget_mb_per_km < LEAST_BUDGET_MB_PER_KM:
+            raise ValueError(f"must be 0 or at least {LEAST_BUDGET_MB_PER_KM:g}: keyframes need some room")
+        return budget_mb_per_km
+
+
 class MapperSettings(_Group):
     """All groups."""
 
@@ -119,6 +133,7 @@ class MapperSettings(_Group):
     tracking: TrackingGroup = TrackingGroup()
     keyframes: KeyframeGroup = KeyframeGroup()
     mapping: MappingGroup = MappingGroup()
+    cells: CellGroup = CellGroup()
     gnss: GnssGroup = GnssGroup()
     calibration: CalibrationGroup = CalibrationGroup()
     quality: QualityGroup = QualityGroup()

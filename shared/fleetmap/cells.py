@@ -13,7 +13,6 @@ from dataclasses import fields
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap.cell import Cell, CellIndex, Ids, cell_attributes, corner_offset_m
 from fleetmap.compact_cells import compact_arrays, read_compact_cell
@@ -23,7 +22,7 @@ from fleetmap.full_part import check_ascending
 from fleetmap.geodesy import UtmAnchor
 from fleetmap.manifest import CELL_SIZE_M, PartRecord
 from fleetmap.parts import decode_part, encode_part
-from fleetmap.visual_map import Keyframes, Landmarks, LocalizationMap, VisualMap
+from fleetmap.visual_map import Keyframes, Landmarks, LocalizationMap, VisualMap, taken
 
 MAX_CELL_BYTES = 128 * 1024 * 1024  # inflated; two million landmarks
 _LAYOUT = 2
@@ -34,11 +33,7 @@ Group = TypeVar("Group", Keyframes, Landmarks)
 
 def split_into_cells(visual_map: VisualMap) -> dict[CellIndex, Cell]:
     """The cells of a map that hold keyframes, in order of their index."""
-    in_utm = visual_map.anchor.utm_from_map(visual_map.keyframes.positions_m)
-    cells, cell_of_keyframe = np.unique(
-        np.floor(in_utm[:, :2] / CELL_SIZE_M).astype(np.int64), axis=0, return_inverse=True
-    )
-    cell_of_keyframe = cell_of_keyframe.reshape(-1)
+    cells, cell_of_keyframe = cells_of_keyframes(visual_map)
     cell_of_observation = cell_of_keyframe[visual_map.observations.keyframe_index]
     by_cell = np.argsort(cell_of_observation, kind="stable")
     borders = np.searchsorted(cell_of_observation[by_cell], np.arange(1, len(cells)))
@@ -46,6 +41,15 @@ def split_into_cells(visual_map: VisualMap) -> dict[CellIndex, Cell]:
         (int(east), int(north)): _cut_out(visual_map, np.flatnonzero(cell_of_keyframe == number), observed)
         for number, ((east, north), observed) in enumerate(zip(cells, np.split(by_cell, borders), strict=True))
     }
+
+
+def cells_of_keyframes(visual_map: VisualMap) -> tuple[Ids, Ids]:
+    """The indices (C, 2) of the cells that hold keyframes, and which of them each keyframe (K,) lies in."""
+    in_utm = visual_map.anchor.utm_from_map(visual_map.keyframes.positions_m)
+    cells, cell_of_keyframe = np.unique(
+        np.floor(in_utm[:, :2] / CELL_SIZE_M).astype(np.int64), axis=0, return_inverse=True
+    )
+    return cells, cell_of_keyframe.reshape(-1)
 
 
 def encode_cell(index: CellIndex, cell: Cell, anchor: UtmAnchor) -> bytes:
@@ -93,12 +97,12 @@ def merge_cells(anchor: UtmAnchor, cells: Sequence[Cell]) -> LocalizationMap:
     seen_by_keyframe = np.concatenate([cell.keyframe_ids[cell.seen_by_keyframe] for cell in cells])
     seen_landmark = np.concatenate([cell.landmark_ids[cell.seen_landmark] for cell in cells])
     order = np.lexsort((seen_landmark, seen_by_keyframe))
-    keyframes = _take(_joined([cell.keyframes for cell in cells]), keyframe_rows)
+    keyframes = taken(_joined([cell.keyframes for cell in cells]), keyframe_rows)
     check_ascending(keyframes.stamps_ns, "keyframe stamps", "the map merged of its cells")
     return LocalizationMap(
         anchor,
         keyframes,
-        _take(_joined([cell.landmarks for cell in cells]), landmark_rows),
+        taken(_joined([cell.landmarks for cell in cells]), landmark_rows),
         np.searchsorted(keyframe_ids, seen_by_keyframe[order]).astype(np.int32),
         np.searchsorted(landmark_ids, seen_landmark[order]).astype(np.int32),
     )
@@ -112,17 +116,12 @@ def _cut_out(visual_map: VisualMap, keyframe_ids: Ids, observed: Ids) -> Cell:
     landmark_ids, seen_landmark = np.unique(pairs & 0xFFFFFFFF, return_inverse=True)
     return Cell(
         keyframe_ids,
-        _take(visual_map.keyframes, keyframe_ids),
+        taken(visual_map.keyframes, keyframe_ids),
         landmark_ids,
-        _take(visual_map.landmarks, landmark_ids),
+        taken(visual_map.landmarks, landmark_ids),
         np.searchsorted(keyframe_ids, pairs >> 32),
         seen_landmark,
     )
-
-
-def _take(group: Group, rows: NDArray[Any]) -> Group:
-    columns: dict[str, Any] = {field.name: getattr(group, field.name) for field in fields(group)}
-    return type(group)(**{name: None if column is None else column[rows] for name, column in columns.items()})
 
 
 def _joined(groups: Sequence[Group]) -> Group:

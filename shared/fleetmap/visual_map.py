@@ -6,7 +6,8 @@ All arrays are parallel within their group and treated as frozen.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,3 +88,15 @@ class LocalizationMap:
     landmarks: Landmarks
     seen_by_keyframe: NDArray[np.int32]  # (M,) int32 sorted; keyframe seen_by_keyframe[m] ...
     seen_landmark: NDArray[np.int32]  # (M,) int32 ... saw landmark seen_landmark[m]
+
+
+Group = TypeVar("Group", Keyframes, Landmarks, Observations)
+
+
+def taken(group: Group, rows: NDArray[np.int64]) -> Group:
+    """Some rows of a group, in their order; what the group does not know stays unknown."""
+    columns: dict[str, Any] = {}
+    for field in fields(group):
+        column = getattr(group, field.name)
+        columns[field.name] = None if column is None else column[rows]
+    return type(group)(**columns)

@@ -14,7 +14,14 @@ from fleetmap_cli.mapping import DriveChoice, map_and_publish, map_recording
 from fleetmap_cli.options import XYZ, ServerAccess, optional_server_options
 from fleetmap_cli.watching import stop_on_signals, watch_folder
 from fleetmap_mapper.setting_assignments import with_assignments
-from fleetmap_mapper.settings import CalibrationGroup, CalibrationMode, GnssGroup, GnssMode, MapperSettings
+from fleetmap_mapper.settings import (
+    CalibrationGroup,
+    CalibrationMode,
+    CellGroup,
+    GnssGroup,
+    GnssMode,
+    MapperSettings,
+)
 
 _PATH = click.Path(path_type=Path)
 _FILE = click.Path(path_type=Path, dir_okay=False)
@@ -56,6 +63,14 @@ _CALIBRATION: dict[bool | None, CalibrationMode] = {None: "auto", True: "refined
     "contradicts the recorded calibration clearly; it is told]",
 )
 @click.option(
+    "--budget-mb-per-km",
+    type=click.FloatRange(min=0.0),
+    default=CellGroup().budget_mb_per_km,
+    show_default=True,
+    help="How much of the map localizers are to fetch: landmarks and keyframes are chosen that help them most.  "
+    "0 gives them everything.",
+)
+@click.option(
     "--set",
     "assignments",
     multiple=True,
@@ -82,6 +97,7 @@ def map_(
     antenna_offset: tuple[float, float, float] | None,
     mask: Path | None,
     refine_calibration: bool | None,
+    budget_mb_per_km: float,
     assignments: tuple[str, ...],
     seed: int,
     force: bool,
@@ -97,15 +113,18 @@ def map_(
     \b
     Examples:
       fleetmap map survey.mcap --output my_map --trajectory survey.tum
+      fleetmap map survey.mcap --output my_map --budget-mb-per-km 0.5
       fleetmap map survey.mcap --output my_map --set quality.min_posed_ratio=0.9
       fleetmap map --watch drives --server tcp/127.0.0.1:7447
     """
     if verbose:
         logging.getLogger("fleetmap_mapper").setLevel(logging.INFO)
     settings = MapperSettings(
-        seed=seed, gnss=GnssGroup(mode=gnss), calibration=CalibrationGroup(mode=_CALIBRATION[refine_calibration])
+        seed=seed,
+        gnss=GnssGroup(mode=gnss),
+        calibration=CalibrationGroup(mode=_CALIBRATION[refine_calibration]),
     )
-    settings = with_assignments(settings, assignments)
+    settings = with_assignments(settings, (f"cells.budget_mb_per_km={budget_mb_per_km}", *assignments))
     if settings.calibration.mode == "refined" and settings.gnss.mode == "mapping":
         raise click.UsageError("--refine-calibration needs an adjustment at the end: --gnss none, final or full")
     choice = DriveChoice(image_topic, gnss_topic, antenna_offset, mask)
@@ -156,6 +175,12 @@ def _report(manifest: Manifest, output: Path) -> int:
     click.echo(f"map:           {output} (id {manifest.map_id}, EPSG:{manifest.anchor.epsg})")
     click.echo(f"images posed:  {quality.frames_posed} of {quality.frames_total}, {quality.length_m:.1f} m")
     click.echo(f"keyframes:     {quality.keyframes}, landmarks {quality.landmarks}")
+    if manifest.localizable is not None:
+        chosen = manifest.localizable
+        click.echo(
+            f"cells:         {chosen.size_bytes / 1e6:.2f} MB, {chosen.keyframes} keyframes and "
+            f"{chosen.landmarks} landmarks for localizers"
+        )
     click.echo(f"reprojection:  {quality.reprojection_rms_px:.2f} px RMS")
     if residual is not None:
         click.echo(

@@ -1,0 +1,192 @@
+"""What of a map goes into its cells, so that other vehicles localise well in few bytes.
+
+Landmarks are chosen one by one, always the one that helps most for its bytes. A landmark helps every keyframe that
+saw it, the more the fewer are chosen already in that part of the keyframe's image and on that octave: a view full
+of landmarks needs no more of them, a bare one takes what there is. It helps less where it is inexact, or easily
+taken for another. The sum of such returns, diminishing as 1/n, is submodular; so the greedy choice is within
+1 - 1/e of the best one, and a heap of outdated gains finds it (lazy evaluation).
+
+Sources: M. Dymczyk et al., "The gist of maps - summarizing experience for lifelong localization", ICRA 2015, and
+S. Lynen et al., "Get out of my lab", RSS 2015, section IV (landmarks that many keyframes saw, every keyframe with
+enough of them); G. Nemhauser, L. Wolsey, M. Fisher, "An analysis of approximations for maximizing submodular set
+functions", 1978; M. Minoux, "Accelerated greedy algorithms", 1978.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.cells import cells_of_keyframes
+from fleetmap.errors import MapPackageError
+from fleetmap.greedy_choice import Views, order_of_use
+from fleetmap.keyframe_thinning import thinned_keyframes
+from fleetmap.landmark_chances import landmark_chances
+from fleetmap.landmark_precision import SCALE_FACTOR, landmark_sigmas_m
+from fleetmap.manifest import Manifest
+from fleetmap.map_package import MapPackage, write_package
+from fleetmap.package_encoding import cell_parts
+from fleetmap.visual_map import VisualMap, taken
+
+Array = NDArray[np.float64]
+Ids = NDArray[np.int64]
+
+BYTES_PER_MB = 1e6
+_COLUMNS, _ROWS = 8, 4
+_MIN_DEPTH_M = 0.1
+_USUAL_BYTES = 42.0  # per landmark and cell
+_CLOSE_ENOUGH = 0.98  # of the budget
+_MAX_TRIALS = 8
+_LEAST_LENGTH_KM = 0.1
+
+
+def choose_for_localizing(visual_map: VisualMap, budget_mb_per_km: float) -> VisualMap:
+    """The keyframes and landmarks whose cells take at most so many megabytes per kilometre of keyframes' way.
+
+    A landmark in two cells counts twice; of ways below 100 m, 100 m count. Landmarks are numbered anew, by where
+    they come into view.
+
+    Raises:
+        MapPackageError: the keyframes alone take more.
+    """
+    limit_bytes = budget_mb_per_km * BYTES_PER_MB * max(_length_km(visual_map), _LEAST_LENGTH_KM)
+    landmarks = replace(visual_map.landmarks, sigmas_m=landmark_sigmas_m(visual_map))
+    thin = thinned_keyframes(replace(visual_map, landmarks=landmarks))
+    order = _in_order_of_use(thin)
+    count, low, high = min(int(limit_bytes / _USUAL_BYTES), len(order)), 0, len(order)
+    best: VisualMap | None = None
+    for _ in range(_MAX_TRIALS):
+        trial = only_landmarks(thin, order[:count])
+        size_bytes = sum(len(data) for data, _ in cell_parts(trial).values())
+        if size_bytes <= limit_bytes:
+            best, low = trial, count
+            if size_bytes >= _CLOSE_ENOUGH * limit_bytes or count == high:
+                break
+        else:
+            high = count - 1
+        missing = int((0.995 * limit_bytes - size_bytes) / _USUAL_BYTES)
+        count = int(np.clip(count + missing, low, high))
+    if best is None:
+        raise MapPackageError(
+            f"{budget_mb_per_km:g} MB/km are too few for the map's keyframes; allow more, or 0 for no limit"
+        )
+    return best
+
+
+def localizable_part(visual_map: VisualMap, budget_mb_per_km: float) -> VisualMap:
+    """What goes into the cells: ``choose_for_localizing``, or the whole map where the budget is 0.
+
+    Raises:
+        MapPackageError: the keyframes alone take more.
+    """
+    return choose_for_localizing(visual_map, budget_mb_per_km) if budget_mb_per_km > 0.0 else visual_map
+
+
+def choose_again(package: MapPackage, folder: Path, budget_mb_per_km: float, *, force: bool = False) -> Manifest:
+    """Write a package anew with another budget for its cells; the map is not made again.
+
+    Raises:
+        OutputExistsError: the folder exists and ``force`` is not given, or what exists is not a map package.
+        MapPackageError: the package has no full part or is damaged, or the keyframes alone take more.
+        StorageError: the disk is full or refuses.
+    """
+    manifest, visual_map = package.manifest, package.visual_map()
+    return write_package(
+        folder,
+        visual_map,
+        map_id=manifest.map_id,
+        quality=manifest.quality,
+        provenance=manifest.provenance,
+        road_quality=package.road_quality(),
+        localizable=localizable_part(visual_map, budget_mb_per_km),
+        force=force,
+    )
+
+
+def only_landmarks(visual_map: VisualMap, kept: Ids) -> VisualMap:
+    """The map with these landmarks only, numbered by the first and the last keyframe that saw them."""
+    observations = visual_map.observations
+    number = np.full(len(visual_map.landmarks), -1, np.int64)
+    number[kept] = np.arange(len(kept))
+    rows = np.flatnonzero(number[observations.landmark_index] >= 0)
+    first, last = np.full(len(kept), len(visual_map.keyframes)), np.full(len(kept), -1)
+    index = number[observations.landmark_index[rows]]
+    np.minimum.at(first, index, observations.keyframe_index[rows])
+    np.maximum.at(last, index, observations.keyframe_index[rows])
+    order = np.lexsort((kept, last, first))
+    number[kept[order]] = np.arange(len(kept))
+    few = taken(observations, rows)
+    return replace(
+        visual_map,
+        landmarks=taken(visual_map.landmarks, kept[order]),
+        observations=replace(few, landmark_index=number[few.landmark_index].astype(np.int32)),
+    )
+
+
+def _length_km(visual_map: VisualMap) -> float:
+    steps_m = np.linalg.norm(np.diff(visual_map.keyframes.positions_m, axis=0), axis=1)
+    return float(steps_m.sum()) / 1000.0
+
+
+def _in_order_of_use(visual_map: VisualMap) -> Ids:
+    """Landmarks (n,), the one that helps most first; those that nobody sees are left out."""
+    cells = _cells_of_landmarks(visual_map)
+    chances = np.where(cells > 0, landmark_chances(visual_map), 0.0)
+    return order_of_use(chances, np.maximum(cells, 1.0), _views(visual_map))[: np.count_nonzero(cells)]
+
+
+def _views(visual_map: VisualMap) -> Views:
+    observations, landmarks, camera = visual_map.observations, visual_map.landmarks, visual_map.camera
+    order = np.argsort(observations.landmark_index, kind="stable")
+    index, keyframe = observations.landmark_index[order], observations.keyframe_index[order].astype(np.int64)
+    cam_from_map = visual_map.keyframes.rotations.transpose(0, 2, 1)[keyframe]
+    in_cam = np.einsum(
+        "mij,mj->mi", cam_from_map, landmarks.points_m[index] - visual_map.keyframes.positions_m[keyframe]
+    )
+    pixels = camera.project_ideal(in_cam)
+    column = np.nan_to_num(pixels[:, 0] * _COLUMNS / camera.width_px).clip(0, _COLUMNS - 1).astype(np.int64)
+    row = np.nan_to_num(pixels[:, 1] * _ROWS / camera.height_px).clip(0, _ROWS - 1).astype(np.int64)
+    return Views(
+        np.searchsorted(index, np.arange(len(landmarks) + 1)),
+        keyframe,
+        (keyframe * _ROWS + row) * _COLUMNS + column,
+        len(visual_map.keyframes) * _ROWS * _COLUMNS,
+        len(visual_map.keyframes),
+        _jacobians(visual_map, in_cam, index),
+    )
+
+
+def _jacobians(visual_map: VisualMap, in_cam: Array, index: NDArray[np.int32]) -> NDArray[np.float32]:
+    """Derivatives (M, 2, 6) of the pixels, in sigmas, of points (M, 3) by the pose; 0 behind the camera.
+
+    p_cam becomes p_cam - w x p_cam - v under map_from_cam exp([w, v]).
+    """
+    camera, landmarks = visual_map.camera, visual_map.landmarks
+    x, y, z = in_cam[:, 0], in_cam[:, 1], np.where(in_cam[:, 2] > _MIN_DEPTH_M, in_cam[:, 2], np.inf)
+    zero = np.zeros_like(x)
+    by_point = np.stack(
+        [
+            np.stack([camera.fx_px / z, zero, -camera.fx_px * x / z**2], axis=1),
+            np.stack([zero, camera.fy_px / z, -camera.fy_px * y / z**2], axis=1),
+        ],
+        axis=1,
+    )
+    z = in_cam[:, 2]
+    by_rotation = np.stack(
+        [np.stack([zero, -z, y], axis=1), np.stack([z, zero, -x], axis=1), np.stack([-y, x, zero], axis=1)], axis=1
+    )  # of p_cam: the matrix of p_cam x
+    jacobians = np.concatenate([by_point @ by_rotation, -by_point], axis=2)
+    feature_px = SCALE_FACTOR ** landmarks.octaves.astype(np.float64)
+    return np.asarray(jacobians / feature_px[index][:, None, None], dtype=np.float32)
+
+
+def _cells_of_landmarks(visual_map: VisualMap) -> Ids:
+    """In how many cells (N,) a landmark will be stored."""
+    _, cell_of_keyframe = cells_of_keyframes(visual_map)
+    observations = visual_map.observations
+    cells = cell_of_keyframe[observations.keyframe_index].astype(np.int64)
+    pairs = np.unique(observations.landmark_index.astype(np.int64) << 32 | cells)
+    return np.bincount(pairs >> 32, minlength=len(visual_map.landmarks))
