@@ -61,6 +61,15 @@ class _SensorList(click.ParamType[frozenset[str]]):
     "  [default: a circuit of 600 m, more only for longer drives; an open road as long as the drive]",
 )
 @click.option(
+    "--world-variant",
+    default=0,
+    show_default=True,
+    type=_SEED,
+    metavar="N",
+    help="Other than 0: a street that could be taken for the world's own. Of the same shape, half of its walls, "
+    "roofs, hedges and pieces of road painted otherwise, and other cars.",
+)
+@click.option(
     "--site",
     type=Numbers("LAT,LON,HEIGHT"),
     default="48.77,11.43,420",
@@ -188,6 +197,7 @@ def _scenario(options: dict[str, Any]) -> Scenario:
         world_seed=options["world"],
         kind=options["kind"],
         world_length_m=options["world_length_m"],
+        world_variant=options["world_variant"],
         site=options["site"],
         drive_seed=options["drive"],
         length_m=options["length_m"],

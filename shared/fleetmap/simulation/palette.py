@@ -22,6 +22,7 @@ Rng = np.random.Generator
 
 STOREY_M = 2.9
 _CRISPNESS, _DETAIL_PX = 1.0, 4.0
+_REPAINTED = 0.5  # share of all picks that differ between variants of a world
 
 
 class WallPaint(Protocol):
@@ -80,17 +81,23 @@ class FreshPaint:
 class Palette:
     """A pool of textures, the same for the same seed whatever order they are asked for in.
 
-    ``richness`` is how many of each kind there are, as a factor.
+    ``richness`` is how many of each kind there are, as a factor. In a ``variant`` other than 0, half of all that
+    is picked is painted otherwise; which half, its number says.
     """
 
-    def __init__(self, seed: int, builder: SurfaceBuilder, richness: float = 1.0) -> None:
-        self._seed, self._builder, self._richness = seed, builder, richness
+    def __init__(self, seed: int, builder: SurfaceBuilder, richness: float = 1.0, variant: int = 0) -> None:
+        self._seed, self._builder, self._richness, self._variant = seed, builder, richness, variant
+        self._variant_rng = np.random.default_rng([seed, variant])
         self._painted: dict[tuple[str, int], int] = {}
         self._cars: dict[int, CarPaint] = {}
 
     def pick(self, rng: Rng, kind: str, count: int, paint: Callable[[Rng], GreyImage]) -> int:
         """One of ``count`` textures of a kind, painted now if it was never asked for."""
-        return self.numbered(kind, int(rng.integers(max(round(count * self._richness), 1))), paint)
+        available = max(round(count * self._richness), 1)
+        number = int(rng.integers(available))
+        if self._variant and self._variant_rng.random() < _REPAINTED:
+            number += available * self._variant
+        return self.numbered(kind, number, paint)
 
     def numbered(self, kind: str, number: int, paint: Callable[[Rng], GreyImage]) -> int:
         """A certain texture of a kind."""

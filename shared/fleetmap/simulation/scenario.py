@@ -35,6 +35,7 @@ class Scenario:
     world_seed: int = 1
     kind: str = "city"
     world_length_m: float | None = None  # None: see ``length_of_world_m``
+    world_variant: int = 0  # other than 0: a street that could be taken for it
     site: tuple[float, float, float] = (
         48.77,
         11.43,
@@ -84,6 +85,7 @@ def simulate_scenario(scenario: Scenario) -> SimulatedDrive:
         scenario.world_seed,
         kind=scenario.kind,
         length_m=scenario.length_of_world_m(),
+        variant=scenario.world_variant,
         drive_seed=scenario.drive_seed,
         moving_cars_per_km=scenario.moving_cars_per_km,
         own_lane_m=scenario.lane_m,

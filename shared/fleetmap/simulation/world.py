@@ -100,6 +100,7 @@ def build_world(
     *,
     kind: str = "city",
     length_m: float = 300.0,
+    variant: int = 0,
     drive_seed: int = 0,
     parked_cars_changed: float = 0.3,
     moving_cars_per_km: float = 8.0,
@@ -118,6 +119,8 @@ def build_world(
             "open": a circuit on a wide place; "facades": a circuit among houses that look alike; "street": one
             bend, no traffic.
         length_m: of the path; of one lap on a circuit.
+        variant: other than 0, a street that could be taken for the seed's own: of the same shape, with half of its
+            walls, roofs, hedges and pieces of road painted otherwise, and other cars. "street" has none.
         drive_seed: of parked cars, moving cars and the sun.
         parked_cars_changed: share of the parked cars that differ between any two drive seeds.
         moving_cars_per_km: oncoming cars; if any, one more drives ahead (a van 6 m ahead from 60 per km on).
@@ -127,22 +130,26 @@ def build_world(
         lat_deg, lon_deg, height_m: the site (ellipsoidal height).
 
     Raises:
-        InputError: no such kind of world, a length or a number that makes no sense, or a site outside UTM.
+        InputError: no such kind of world, or no variant of it, a length or a number that makes no sense, or a
+            site outside UTM.
     """
     if kind not in WORLD_KINDS:
         raise InputError(f"there is no world of kind {kind!r}; choose from {', '.join(WORLD_KINDS)}")
     if kind == "street":
+        if variant:
+            raise InputError("a world of kind 'street' has no variants")
         return World.of_street(build_street(seed, length_m, lat_deg=lat_deg, lon_deg=lon_deg, height_m=height_m))
     _require_sense(length_m, parked_cars_changed, moving_cars_per_km)
     anchor = anchor_at(lat_deg, lon_deg, height_m)
     plan_rng, far_rng = np.random.default_rng(seed).spawn(2)
     drive_rng = np.random.default_rng([seed, drive_seed])
     builder = SurfaceBuilder(_towards_sun(drive_rng, sun_deg))
-    palette = Palette(seed, builder)
+    palette = Palette(seed, builder, variant=variant)
     plot = _LAYOUTS[kind](plan_rng, builder, palette, length_m)
     markers = set_up_markers(builder, palette, plot)
     lay_horizon(far_rng, builder, plot.path)
-    traffic.park_cars(builder, palette, plot.kerbs, seed, drive_seed, parked_cars_changed)
+    cars_seed = seed + (variant << 31)
+    traffic.park_cars(builder, palette, plot.kerbs, cars_seed, drive_seed, parked_cars_changed)
     moving = traffic.send_traffic(
         drive_rng,
         builder,

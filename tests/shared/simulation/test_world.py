@@ -53,6 +53,22 @@ def test_the_same_seeds_build_the_same_world(world: World, request: pytest.Fixtu
     assert _fingerprint(build_world(7, kind=kind, length_m=LENGTH_M)) == _fingerprint(world)
 
 
+def test_a_variant_has_the_same_shape_and_half_of_its_walls_otherwise() -> None:
+    base, variant = _world("city"), build_world(7, length_m=LENGTH_M, variant=1)
+    walls = slice(0, 200)  # laid before the cars, which are others
+    assert np.array_equal(base.surfaces.corners_in_map[walls], variant.surfaces.corners_in_map[walls])
+    same = base.surfaces.texture_indices[walls] == variant.surfaces.texture_indices[walls]
+    assert not np.all(same)
+    views = [render(world, CAMERA, _looking_ahead(world, 20.0), CLEAN).astype(int) for world in (base, variant)]
+    changed = np.mean(np.abs(views[0] - views[1]) > 12)
+    assert 0.1 < changed < 0.8
+
+
+def test_a_world_of_one_bend_has_no_variants() -> None:
+    with pytest.raises(InputError, match="no variants"):
+        build_world(7, kind="street", length_m=LENGTH_M, variant=1)
+
+
 def test_a_drive_changes_cars_and_sun_and_nothing_else() -> None:
     base = build_world(7, length_m=LENGTH_M, parked_cars_changed=0.0, moving_cars_per_km=0.0)
     other = build_world(7, length_m=LENGTH_M, drive_seed=1, parked_cars_changed=0.0, moving_cars_per_km=20.0)
