@@ -47,7 +47,6 @@ class MapView:
             content.seen_by_keyframe,
             content.seen_landmark,
             len(content.keyframes),
-            settings.place_index,
         )
 
     def reaches(self, position_in_map_m: NDArray[np.float64]) -> bool:

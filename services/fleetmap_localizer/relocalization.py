@@ -12,6 +12,7 @@ from fleetmap.geometry import Pose
 from fleetmap.vision.absolute_pose import AbsolutePoseSettings, estimate_absolute_pose
 from fleetmap.vision.features import Features
 from fleetmap.vision.matching import match_descriptors
+from fleetmap.vision.place_recognition import PlaceSearch
 from fleetmap_localizer.fitting import fit_around
 from fleetmap_localizer.gate import Fit, is_same_place, is_trustworthy
 from fleetmap_localizer.local_map import Indices
@@ -41,14 +42,23 @@ def relocalize(
     views: Sequence[MapView], camera: Camera, features: Features, settings: LocalizerSettings
 ) -> Located | str:
     """The one place in all maps that explains an image; or why there is none, in words for people."""
+    options = settings.relocalization
+    search = PlaceSearch([view.places for view in views], features.descriptors, settings.place_index)
     found: list[Located] = []
-    for view, landmarks in _candidate_places(views, features, settings.relocalization):
-        initial = _pose_among(view, camera, features, landmarks, settings.relocalization)
+    firmest = 0.0  # score of what is found so far
+    for score, number, landmarks in _candidate_places(views, search, options):
+        if score < options.min_rival_score * firmest:
+            break
+        view = views[number]
+        initial = _pose_among(view, camera, features, landmarks, options)
         if initial is None or any(_is_found(each, view, initial) for each in found):
             continue
-        fit = fit_around(view, camera, features, initial, settings.relocalization.radii_px, settings.fitting)
+        fit = fit_around(view, camera, features, initial, options.radii_px, settings.fitting)
         if fit is not None:
             found.append(Located(view, fit))
+            search.explain(number, fit.landmarks[fit.answer.inliers])
+            if is_trustworthy(fit, camera, options.gate):
+                firmest = max(firmest, score)
     if not found:
         return "the image shows no place that the map knows"
     best = max(found, key=lambda each: each.inlier_count)
@@ -76,19 +86,18 @@ def _is_rival(one: Located, best: Located, max_rival: float) -> bool:
 
 
 def _candidate_places(
-    views: Sequence[MapView], features: Features, settings: RelocalizationSettings
-) -> Iterator[tuple[MapView, Indices]]:
-    """Landmarks of the likeliest places, best first; no keyframe stands for two of them."""
-    scores = [view.places.scores(features.descriptors) for view in views]
+    views: Sequence[MapView], search: PlaceSearch, settings: RelocalizationSettings
+) -> Iterator[tuple[float, int, Indices]]:
+    """Score, view and landmarks of the likeliest places, best first; no keyframe stands for two of them."""
     for _ in range(settings.candidates):
-        highest = [float(each.max(initial=0.0)) for each in scores]
-        if not highest or max(highest) <= 0.0:
+        highest = [float(each.max(initial=0.0)) for each in search.scores]
+        if not highest or max(highest) < settings.min_score:
             return
         number = int(np.argmax(highest))
-        local_map, best = views[number].local_map, int(np.argmax(scores[number]))
+        local_map, best = views[number].local_map, int(np.argmax(search.scores[number]))
         group = np.append(local_map.covisible(best, settings.min_shared_landmarks, settings.neighbours), best)
-        scores[number][group] = 0.0
-        yield views[number], local_map.landmarks_of(group, settings.max_landmarks)
+        search.dismiss(number, group)
+        yield highest[number], number, local_map.landmarks_of(group, settings.max_landmarks)
 
 
 def _pose_among(

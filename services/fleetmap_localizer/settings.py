@@ -42,7 +42,9 @@ class FittingSettings:
 class RelocalizationSettings:
     """The search from nothing."""
 
-    candidates: int = 5  # places tried
+    candidates: int = 8  # places tried
+    min_score: float = 3.0  # of a place, in standard deviations of chance, to be tried
+    min_rival_score: float = 0.35  # of that of a place found; what is less alike is not tried any more
     neighbours: int = 8  # covisible keyframes that join a candidate
     min_shared_landmarks: int = 15  # to call two keyframes covisible
     max_landmarks: int = 800  # of a candidate
