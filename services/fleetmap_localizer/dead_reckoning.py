@@ -6,6 +6,8 @@ them there is no prediction: that a vehicle went on as before would be a guess.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,10 +15,11 @@ from fleetmap.drive import Drive, GnssFix, WheelSpeed
 from fleetmap.errors import InputError
 from fleetmap.geometry import CAM_FROM_BODY, Pose
 from fleetmap_localizer.filter_settings import DeadReckoningSettings
-from fleetmap_localizer.filter_start import start_filter
-from fleetmap_localizer.motion_filter import MotionFilter, Rig
 from fleetmap_localizer.pose_estimate import PoseEstimate
 from fleetmap_localizer.sensor_streams import ImuStream, SensorStream
+
+if TYPE_CHECKING:  # the filter is compiled code: drives without such sensors start without it
+    from fleetmap_localizer.motion_filter import MotionFilter, Rig
 
 Array = NDArray[np.float64]
 
@@ -60,6 +63,8 @@ class DeadReckoning:
         fixes = drive.gnss_fixes() if use_gnss else []
         if mounting is None and vehicle is None and not fixes:
             return None
+        from fleetmap_localizer.motion_filter import Rig
+
         cam_from_vehicle = vehicle.cam_from_sensor if vehicle else Pose(CAM_FROM_BODY, np.zeros(3))
         cam_from_base = mounting.cam_from_sensor if mounting else cam_from_vehicle
         base_from_cam = cam_from_base.inverse()
@@ -119,6 +124,8 @@ class DeadReckoning:
         return pose
 
     def _start(self, first: PoseEstimate, second: PoseEstimate) -> None:
+        from fleetmap_localizer.filter_start import start_filter
+
         has_imu = self._imu is not None
         self._filter = start_filter(first, second, self._rig, has_imu=has_imu, settings=self._settings)
         self._contradictions = 0

@@ -14,7 +14,6 @@ from typing import Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
-from pyproj import Geod
 
 from fleetmap.manifest import Manifest, MapId, Sha256
 
@@ -141,6 +140,8 @@ def distances_m(
     Returns:
         As many as there are paths.
     """
+    from pyproj import Geod  # here, so that clients that do not sort maps start without it
+
     if not paths_lonlat:
         return np.empty(0)
     shrink = max(float(np.cos(np.radians(lat_deg))), 1e-9)

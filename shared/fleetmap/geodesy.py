@@ -1,5 +1,7 @@
 """WGS84 <-> UTM, map anchors, grid convergence and point scale factor. All of it is pyproj's work.
 
+pyproj is imported when a place on the globe is first asked for: a localizer in one map may never ask.
+
 Heights are ellipsoidal throughout. UTM is not a local east-north-up frame: grid north turns away from
 true north by the convergence, and grid metres relate to ground metres by the point scale factor.
 """
@@ -8,13 +10,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from pyproj import CRS, Proj, Transformer
-from pyproj.exceptions import CRSError
 
 from fleetmap.errors import InputError
+
+if TYPE_CHECKING:
+    from pyproj import Proj, Transformer
 
 Array = NDArray[np.float64]
 
@@ -109,11 +113,16 @@ def normal_gravity_m_s2(lat_deg: float, height_m: float) -> float:
 
 @lru_cache(maxsize=64)
 def _transformer(epsg: int) -> Transformer:
+    from pyproj import Transformer
+
     return Transformer.from_crs("EPSG:4326", f"EPSG:{epsg}", always_xy=True)
 
 
 @lru_cache(maxsize=64)
 def _projection(epsg: int) -> Proj:
+    from pyproj import CRS, Proj
+    from pyproj.exceptions import CRSError
+
     try:
         return Proj(CRS.from_epsg(epsg))
     except CRSError as error:
