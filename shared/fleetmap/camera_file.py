@@ -26,13 +26,32 @@ _OTHER_NAMES: dict[str, DistortionModel] = {
 }
 
 
+class _PlainLoader(yaml.SafeLoader):
+    """Takes no aliases: a few hundred bytes of them can stand for gigabytes, and no calibration needs any."""
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        if self.check_event(yaml.AliasEvent):
+            raise yaml.YAMLError("aliases such as *this are not taken")
+        return super().compose_node(parent, index)
+
+
 def read_camera(path: Path) -> Camera:
     """The camera of a calibration file.
 
     Raises:
         CalibrationError: not there, not YAML in that layout, or numbers that make no camera.
     """
-    content = _parsed(path)
+    try:
+        with path.open("rb") as file:
+            text = file.read(_SIZE_LIMIT_BYTES + 1)
+    except OSError as error:
+        raise CalibrationError(f"cannot read camera file {path}: {error.strerror or error}") from error
+    return parse_camera(text, f"camera file {path}")
+
+
+def parse_camera(text: bytes | str, source: str) -> Camera:
+    """The camera of a calibration file's content; ``source`` names it in errors. Raises as ``read_camera``."""
+    content = _parsed(text, source)
     try:
         K = np.array(_numbers(content, "camera_matrix", 9)).reshape(3, 3)
         coefficients = tuple(_numbers(content, "distortion_coefficients", None))
@@ -44,7 +63,7 @@ def read_camera(path: Path) -> Camera:
             coefficients,
         )
     except CalibrationError as error:
-        raise CalibrationError(f"camera file {path}: {error}") from error
+        raise CalibrationError(f"{source}: {error}") from error
 
 
 def write_camera(path: Path, camera: Camera, *, name: str = "camera", force: bool = False) -> None:
@@ -103,20 +122,15 @@ def camera_of_model(
     )
 
 
-def _parsed(path: Path) -> dict[str, Any]:
+def _parsed(text: bytes | str, source: str) -> dict[str, Any]:
     try:
-        with path.open("rb") as file:
-            text = file.read(_SIZE_LIMIT_BYTES + 1)
-    except OSError as error:
-        raise CalibrationError(f"cannot read camera file {path}: {error.strerror or error}") from error
-    try:
-        content = yaml.safe_load(text) if len(text) <= _SIZE_LIMIT_BYTES else None
+        content = yaml.load(text, _PlainLoader) if len(text) <= _SIZE_LIMIT_BYTES else None
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         reason = " ".join(str(error).split())
-        raise CalibrationError(f"camera file {path} is not YAML: {reason}") from error
+        raise CalibrationError(f"{source} is not YAML: {reason}") from error
     if not isinstance(content, dict):
         raise CalibrationError(
-            f"camera file {path} is no calibration; it needs image_width, image_height, camera_matrix,"
+            f"{source} is no calibration; it needs image_width, image_height, camera_matrix,"
             " distortion_model and distortion_coefficients, as ROS' camera_calibration writes them"
         )
     return content

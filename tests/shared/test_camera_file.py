@@ -92,3 +92,10 @@ def test_a_file_that_is_no_calibration_is_refused_with_its_name_and_the_reason(
 def test_a_file_that_is_not_there_is_refused(tmp_path: Path) -> None:
     with pytest.raises(CalibrationError, match=r"cannot read camera file .*nowhere\.yaml: No such file"):
         read_camera(tmp_path / "nowhere.yaml")
+
+
+def test_a_few_bytes_that_stand_for_gigabytes_are_refused_at_once(tmp_path):
+    lines = [f"a{i}: &a{i} {{<<: [{', '.join([f'*a{i - 1}'] * 9)}]}}" for i in range(1, 12)]
+    (tmp_path / "camera.yaml").write_text("\n".join(["a0: &a0 {x: 1}", *lines]))
+    with pytest.raises(CalibrationError, match="aliases such as"):
+        read_camera(tmp_path / "camera.yaml")
