@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import logging
-
 from pydantic import ValidationError
 
 from fleetmap.errors import (
@@ -16,11 +14,11 @@ from fleetmap.errors import (
     RunError,
     StorageError,
 )
-from fleetmap.transport.protocol import PROBLEM_TYPE_PREFIX, Problem
+from fleetmap.transport.localizers import NoLocalizerError
+from fleetmap.transport.problems import ProblemRow, problem_document
+from fleetmap.transport.protocol import Problem
 
 PROBLEM_MEDIA_TYPE = "application/problem+json"
-
-_log = logging.getLogger(__name__)
 
 
 class NotFoundError(InputError):
@@ -57,8 +55,8 @@ class BusyError(RunError):
     retry_after_s = 1.0
 
 
-# Kind, status, the end of the problem's type, title. The first row that fits counts.
-_PROBLEMS: tuple[tuple[type[Exception], int, str, str], ...] = (
+# The first row that fits counts.
+_PROBLEMS: tuple[ProblemRow, ...] = (
     (UnauthorizedError, 401, "unauthorized", "Token needed"),
     (ForbiddenError, 403, "forbidden", "Not allowed"),
     (NotFoundError, 404, "not-found", "Not found"),
@@ -71,6 +69,7 @@ _PROBLEMS: tuple[tuple[type[Exception], int, str, str], ...] = (
     (DriveError, 422, "unacceptable", "Not an acceptable drive"),
     (StorageError, 507, "storage", "Storage full or failing"),
     (BusyError, 503, "busy", "Busy"),
+    (NoLocalizerError, 503, "no-localizer", "No localizer"),
     (InputError, 400, "bad-request", "Bad request"),
     (ValidationError, 400, "bad-request", "Bad request"),
     (FleetmapError, 500, "failed", "Server error"),
@@ -79,28 +78,4 @@ _PROBLEMS: tuple[tuple[type[Exception], int, str, str], ...] = (
 
 def problem_of(error: Exception) -> Problem:
     """The problem document for whatever a request raised; what nobody foresaw is logged and told as 500."""
-    for kind, status, name, title in _PROBLEMS:
-        if isinstance(error, kind):
-            return Problem(
-                type=PROBLEM_TYPE_PREFIX + name,
-                title=title,
-                status=status,
-                detail=_detail(error),
-                retry_after_s=getattr(error, "retry_after_s", None),
-            )
-    _log.error("request failed", exc_info=error)
-    return Problem(
-        type=PROBLEM_TYPE_PREFIX + "failed",
-        title="Internal error",
-        status=500,
-        detail=f"the server failed: {type(error).__name__}",
-    )
-
-
-def _detail(error: Exception) -> str:
-    if not isinstance(error, ValidationError):
-        return str(error)
-    first = error.errors()[0]
-    message = first["msg"].removeprefix("Value error, ")
-    where = ".".join(str(step) for step in first["loc"])
-    return f"'{where}' does not hold: {message}" if where else message
+    return problem_document(error, _PROBLEMS, "server")

@@ -9,6 +9,7 @@ from functools import partial
 from threading import Event, Thread
 
 from fleetmap.errors import RunError
+from fleetmap.transport.localizers import LocalizerPool
 from fleetmap_server.access import Access, read_access
 from fleetmap_server.http.app import create_app
 from fleetmap_server.http_face import HttpFace, listening_socket, serving_http
@@ -93,9 +94,12 @@ def running_server(settings: ServerSettings) -> Iterator[RunningServer]:
     ):
         metrics = ServerMetrics(library.storage.database, library.storage.objects.free_bytes)
         observe = partial(_note_request, metrics)
-        with ZenohFace(library, settings.zenoh_endpoint, settings.peers, access, observe) as zenoh:
+        with (
+            closing(LocalizerPool(settings.localizers)) as localizers,
+            ZenohFace(library, settings.zenoh_endpoint, settings.peers, access, observe, localizers) as zenoh,
+        ):
             metrics.count_vehicles(zenoh.vehicles_online)
-            app = create_app(library, access, metrics, _readiness(library))
+            app = create_app(library, access, metrics, _readiness(library), localizers)
             with serving_http(app, listening) as http:
                 yield RunningServer(library, settings.zenoh_endpoint, http.url, zenoh, http)
 

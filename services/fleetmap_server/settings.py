@@ -29,6 +29,7 @@ class ServerSettings:
     catalogue: str | None = None  # URL of a database; None: an SQLite file in the store's folder
     access_file: Path | None = None  # who may read and write; None: everyone may
     peers: tuple[str, ...] = ()  # Zenoh endpoints of other servers of the same mesh
+    localizers: tuple[str, ...] = ()  # Zenoh endpoints of services that say where images were taken
     keep_versions: int | None = None  # of each map; None: all
     drain_s: float = DEFAULT_DRAIN_S  # how long transfers under way may go on after SIGTERM
     lease_s: float = DEFAULT_LEASE_S  # how long a worker may be silent before its job is given to another

@@ -15,7 +15,9 @@ from pydantic import BaseModel
 
 from fleetmap import __version__
 from fleetmap.jobs import MAX_SUMMARY_BYTES, DriveSummary
+from fleetmap.localization import LocalizeRequest
 from fleetmap.transport import protocol
+from fleetmap.transport.localizers import LocalizerPool
 from fleetmap.transport.operations import OPERATIONS
 from fleetmap.transport.service import Handler, Observe, Request, RequestService
 from fleetmap_server.access import Access
@@ -39,6 +41,7 @@ class ZenohFace:
         peers: endpoints of other servers to form a mesh with; they need not be there yet.
         access: who may do what.
         observe: see RequestService.
+        localizers: what images are handed on to; None: there is nobody.
 
     Raises:
         InputError: an endpoint is malformed.
@@ -52,8 +55,10 @@ class ZenohFace:
         peers: Sequence[str] = (),
         access: Access | None = None,
         observe: Observe | None = None,
+        localizers: LocalizerPool | None = None,
     ) -> None:
         self._library, self._access = library, access or Access()
+        self._localizers = localizers or LocalizerPool(())
         self._announcer = Announcer(library.catalogue, lambda announcement: self._service.announce(announcement))
         try:
             self._service = RequestService(endpoint, self._handlers(), problem_of, peers, observe)
@@ -98,6 +103,7 @@ class ZenohFace:
                 message.map_id, message.version
             ),
             protocol.CHUNK: self._chunk,
+            protocol.LOCALIZE: self._localize,
             protocol.UPLOAD_BEGIN: lambda message, request: self._library.begin(message),
             protocol.UPLOAD_CHUNK: self._receive,
             protocol.UPLOAD_COMMIT: self._commit,
@@ -120,7 +126,7 @@ class ZenohFace:
     def _hello(self, message: protocol.HelloRequest, request: Request) -> BaseModel:
         caller = self._access.caller(request.token)
         return protocol.Hello(
-            service="fleetmap-server",
+            service=protocol.MAP_SERVER,
             protocol=protocol.PROTOCOL_VERSION,
             fleetmap_version=__version__,
             server_id=request.server_id,
@@ -134,6 +140,9 @@ class ZenohFace:
 
     def _chunk(self, message: protocol.ChunkRequest, request: Request) -> bytes:
         return self._library.chunk(message.version, message.sha256, message.offset, message.length_bytes)
+
+    def _localize(self, message: LocalizeRequest, request: Request) -> BaseModel:
+        return self._localizers.localize(message, request.payload, request.token)
 
     def _receive(self, message: protocol.UploadChunkRequest, request: Request) -> BaseModel:
         data = request.payload

@@ -2,8 +2,8 @@
 
 Outer frame: east, north, up at the position, with true north; UTM's grid is turned against it by the convergence.
 Inner frame: of the camera as a body (REP-103): x where it looks, y to its left, z up in the image. The quaternion
-turns the outer frame's axes into the inner one's: it takes what is written in the inner frame into the outer one, and
-is the identity for a level camera that looks east.
+turns the outer frame's axes into the inner one's: it takes what is written in the inner frame into the outer one,
+and is the identity for a level camera that looks east.
 
 Source: OGC 21-056r11, "GeoPose 1.0 Data Exchange Standard"; it leaves room for members of one's own.
 """
@@ -94,7 +94,7 @@ class GeoPose(_Model):
         return float(np.degrees(np.arctan2(east, north)) % 360.0)
 
     def utm_from_cam(self) -> Pose:
-        """The pose on the grid, as the localizer has it: easting, northing, height; cam x right, y down, z forward."""
+        """The pose on the grid: easting, northing, height; cam x right, y down, z forward."""
         grid_from_enu = UtmGrid(self.utm.epsg).grid_from_enu(self.position.lat, self.position.lon)
         rotation = grid_from_enu @ _rotation(self.quaternion) @ CAM_FROM_BODY.T
         return Pose(rotation, np.array([self.utm.easting_m, self.utm.northing_m, self.utm.height_m]))

@@ -83,7 +83,7 @@ class SlowReader:
 def listens(http_url: str) -> bool:
     try:
         socket.create_connection((urlsplit(http_url).hostname, urlsplit(http_url).port), timeout=10.0).close()
-    except ConnectionRefusedError:
+    except (ConnectionRefusedError, ConnectionResetError):  # the latter just while it closes
         return False
     return True
 

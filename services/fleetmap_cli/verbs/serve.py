@@ -62,6 +62,14 @@ class _HostPort(click.ParamType[tuple[str, int]]):
     help="Another server or Zenoh router to form a mesh with; it need not be there yet. May be given repeatedly.",
 )
 @click.option(
+    "--localizer",
+    "localizers",
+    metavar="tcp/HOST:PORT",
+    multiple=True,
+    help="A 'fleetmap locator' that images sent to POST /localize are handed on to, with the sender's token; it need "
+    "not be there yet. May be given repeatedly.",
+)
+@click.option(
     "--http",
     type=_HostPort(),
     default=f"{DEFAULT_HTTP_HOST}:{DEFAULT_HTTP_PORT}",

@@ -8,13 +8,15 @@ from fastapi import APIRouter, Depends, FastAPI, Request
 from fastapi.middleware.cors import CORSMiddleware
 
 from fleetmap import __version__
+from fleetmap.transport.localizers import LocalizerPool
 from fleetmap_server.access import Access
 from fleetmap_server.http.answers import describe, explain_errors
 from fleetmap_server.http.blobs import blob_router
-from fleetmap_server.http.body_limit import BodyLimit
+from fleetmap_server.http.body_limit import MAX_SEARCH_BYTES, BodyLimit
 from fleetmap_server.http.drive_uploads import drive_upload_router
 from fleetmap_server.http.drives import drive_router
 from fleetmap_server.http.guard import Guard, right_of
+from fleetmap_server.http.localizing import MAX_LOCALIZE_BYTES, localize_router
 from fleetmap_server.http.metrics import health_router, metrics_router
 from fleetmap_server.http.pages import page_router
 from fleetmap_server.http.preview_routes import preview_router
@@ -31,6 +33,7 @@ def create_app(
     access: Access | None = None,
     metrics: ServerMetrics | None = None,
     readiness: Readiness | None = None,
+    localizers: LocalizerPool | None = None,
 ) -> FastAPI:
     """The web application over a library that is open; routes raise, and one place turns errors into answers.
 
@@ -39,6 +42,7 @@ def create_app(
         access: what tokens may do; None: everybody may do everything.
         metrics: what is counted; None: nobody else counts.
         readiness: what ``/readyz`` asks; None: nothing.
+        localizers: what images are handed on to; None: there is nobody.
     """
     access, metrics = access or Access(), metrics or ServerMetrics()
     private = not access.is_open
@@ -54,8 +58,9 @@ def create_app(
     explain_errors(app)
     for router in _routers(library, private, metrics, readiness or Readiness({})):
         app.include_router(router)
+    app.include_router(localize_router(localizers or LocalizerPool(())))
     describe(app)
-    app.add_middleware(BodyLimit, paths=("/search",))
+    app.add_middleware(BodyLimit, limits_bytes={"/search": MAX_SEARCH_BYTES, "/localize": MAX_LOCALIZE_BYTES})
     app.add_middleware(
         CORSMiddleware, allow_origins=["*"], allow_methods=["GET", "HEAD", "POST"], allow_headers=["*"]
     )

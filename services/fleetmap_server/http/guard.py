@@ -9,7 +9,7 @@ from fleetmap_server.access import Access, token_of
 from fleetmap_server.logs import name_caller
 
 _FOR_EVERYBODY = frozenset({"/healthz", "/readyz"})
-_READING_POSTS = frozenset({"/search"})  # questions too long for an address
+_READING_POSTS = frozenset({"/search", "/localize"})  # questions too long for an address
 _FOR_WRITERS = "/drives/uploads/"  # also to ask how far an upload is: where all of it is here, that completes it
 
 

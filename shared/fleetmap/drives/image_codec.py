@@ -17,8 +17,13 @@ _PIXEL_LIMIT = 100_000_000  # a damaged header can claim 4 gigapixels, and the d
 Image = NDArray[np.uint8]
 
 
-def decode_compressed(data: bytes, image_format: str) -> Image:
+def decode_compressed(data: bytes, image_format: str, max_pixels: int = _PIXEL_LIMIT) -> Image:
     """A JPEG, PNG or WebP as grey (height, width), whole and as the sensor saw it (EXIF orientation ignored).
+
+    Args:
+        data: all of it.
+        image_format: what it was said to be, for errors.
+        max_pixels: a JPEG or PNG that claims more is not decoded.
 
     Raises:
         ValueError: none of these, truncated, or damaged.
@@ -35,8 +40,8 @@ def decode_compressed(data: bytes, image_format: str) -> Image:
     if not is_whole:
         raise ValueError(f"its {len(data)} bytes end in the middle of the image")
     width, height = _claimed_size(data)
-    if width * height > _PIXEL_LIMIT:
-        raise ValueError(f"it claims {width}x{height} pixels; {_PIXEL_LIMIT:,} are read at most")
+    if width * height > max_pixels:
+        raise ValueError(f"it claims {width}x{height} pixels; {max_pixels:,} are read at most")
     try:
         image = cv2.imdecode(
             np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION

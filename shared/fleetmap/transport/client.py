@@ -13,6 +13,7 @@ from pydantic import TypeAdapter, ValidationError
 from fleetmap.catalogue import NEAR_RADIUS_M, MapEntry
 from fleetmap.errors import InputError, TransferError
 from fleetmap.jobs import DriveEntry, DriveSummary, JobEntry
+from fleetmap.localization import Localized, LocalizeRequest
 from fleetmap.manifest import MAX_MANIFEST_BYTES, parse_manifest
 from fleetmap.transport import protocol
 from fleetmap.transport.announcements import Announcements
@@ -176,6 +177,11 @@ class MapClient:
             for sha256, size_bytes in sizes_bytes.items()
         ]
         return download(self._link, wanted)
+
+    def localize_image(self, image: bytes, request: LocalizeRequest) -> Localized:
+        """Where an image (JPEG or PNG) was taken, as the server's localizer finds it."""
+        pending = self._link.start(protocol.LOCALIZE, request.model_dump(exclude_none=True), image)
+        return self._link.read(Localized, pending.finish())
 
     def publish(
         self,

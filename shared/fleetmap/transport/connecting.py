@@ -17,25 +17,31 @@ _PROBE_S, _CONNECT_S = 1.0, 2.0
 _PAUSE_S = 0.1  # between two rounds through the endpoints
 _SLOW_HELLO_S = 10.0  # of a server that is there, and busy
 _UNAUTHORIZED, _FORBIDDEN = 401, 403
+_SERVICES = {protocol.MAP_SERVER: ("map server", "serve"), protocol.LOCALIZER: ("localizer", "locator")}
 _CLOSED = "answers nobody without a token; give --token-file, or FLEETMAP_TOKEN"
 _LOCKED_OUT = "does not let this token read; ask its operator"
 
 
 def connect(
-    endpoints: Sequence[str], token: str | None, deadline_s: float, refused_deadline_s: float
+    endpoints: Sequence[str],
+    token: str | None,
+    deadline_s: float,
+    refused_deadline_s: float,
+    service: str = protocol.MAP_SERVER,
 ) -> tuple[Connection, protocol.Hello]:
-    """A connection to the first of some endpoints where a map server says hello.
+    """A connection to the first of some endpoints where a map server, or a localizer, says hello.
 
     Args:
         endpoints: of servers that have the same maps; tried in turn, again and again.
         token: goes with every request.
         deadline_s: of the monotonic clock; each endpoint is tried once at least.
         refused_deadline_s: the same where machines are there, and refuse the connection.
+        service: whose hello is wanted.
 
     Raises:
         AccessDeniedError: it lets nobody in without a token, or does not know ours.
-        ServerRefusedError: it speaks another version of the protocol.
-        ServerUnreachableError: no map server was there until the deadline.
+        ServerRefusedError: it speaks another version of the protocol, or is the other of the two services.
+        ServerUnreachableError: none was there until the deadline.
     """
     while True:
         why: ServerUnreachableError | None = None
@@ -47,12 +53,13 @@ def connect(
             if probe != "accepts":
                 continue
             try:
-                return _connect(endpoint, token, min(left_s, _CONNECT_S / len(endpoints)))
+                return _connect(endpoint, token, min(left_s, _CONNECT_S / len(endpoints)), service)
             except ServerUnreachableError as error:
                 why = error
         if time.monotonic() > (refused_deadline_s if are_refused else deadline_s):
+            what, verb = _SERVICES[service]
             raise why or ServerUnreachableError(
-                f"no map server answers at {' or '.join(endpoints)}; start one with 'fleetmap serve', "
+                f"no {what} answers at {' or '.join(endpoints)}; start one with 'fleetmap {verb}', "
                 "or give its endpoint"
             )
         time.sleep(_PAUSE_S)
@@ -70,16 +77,18 @@ def _probe(endpoint: str, timeout_s: float) -> Literal["accepts", "refuses", "si
     return "accepts"
 
 
-def _connect(endpoint: str, token: str | None, timeout_s: float) -> tuple[Connection, protocol.Hello]:
+def _connect(
+    endpoint: str, token: str | None, timeout_s: float, service: str
+) -> tuple[Connection, protocol.Hello]:
     connection = Connection(endpoint, timeout_s, token)
     try:
-        return connection, _greet(connection)
+        return connection, _greet(connection, service)
     except BaseException:
         connection.close()
         raise
 
 
-def _greet(connection: Connection) -> protocol.Hello:
+def _greet(connection: Connection, service: str) -> protocol.Hello:
     """Make sure that a map server is behind the connection, Zenoh alone does not tell; requests then go to it."""
     endpoint = connection.endpoint
     try:
@@ -95,6 +104,8 @@ def _greet(connection: Connection) -> protocol.Hello:
     except ValidationError as error:
         raise _no_map_server(endpoint) from error
     _check_version(hello, endpoint)
+    if (hello.service == protocol.LOCALIZER) != (service == protocol.LOCALIZER):
+        raise ServerRefusedError(f"a {hello.service} answers at {endpoint}; give the endpoint of a {service}")
     if not hello.server_id:
         raise _no_map_server(endpoint)
     if not hello.may_read:

@@ -31,6 +31,7 @@ _REFUSED_S = 0.5  # sooner where its machine is there and says so; it may be sta
 _MAX_TIMEOUT_GROWTH = 8
 _PAUSE_S = 0.1  # between two attempts at the same request
 _STATUS_BUSY, _STATUS_DISK_FULL = 503, 507
+_NO_LOCALIZER = f"{protocol.PROBLEM_TYPE_PREFIX}no-localizer"  # nor will there soon be one
 _REFUSALS: dict[str, type[RunError]] = {
     "unauthorized": AccessDeniedError,
     "forbidden": AccessDeniedError,
@@ -138,7 +139,8 @@ class ServerLink:
                 return answer
             except ProblemError as error:
                 deadline_s = deadline_s or time.monotonic() + self._patience_s
-                if error.problem.status != _STATUS_BUSY or time.monotonic() > deadline_s:
+                is_busy = error.problem.status == _STATUS_BUSY and error.problem.type != _NO_LOCALIZER
+                if not is_busy or time.monotonic() > deadline_s:
                     raise self._refusal(error.problem) from error
                 time.sleep(_PAUSE_S)
             except NoAnswerError as error:

@@ -9,6 +9,7 @@ from pydantic import BaseModel
 
 from fleetmap.catalogue import MapEntry
 from fleetmap.jobs import DriveSummary, JobEntry
+from fleetmap.localization import Localized, LocalizeRequest
 from fleetmap.transport import protocol
 
 Right = Literal["none", "read", "write"]
@@ -33,6 +34,7 @@ OPERATIONS: dict[str, Operation] = {
     protocol.ANNOUNCEMENTS: Operation(protocol.AnnouncementsRequest, protocol.AnnouncementPage, "read"),
     protocol.MANIFEST: Operation(protocol.ManifestRequest, protocol.BlobTicket, "read"),
     protocol.CHUNK: Operation(protocol.ChunkRequest, None, "read", bulk=True),
+    protocol.LOCALIZE: Operation(LocalizeRequest, Localized, "read", "bytes", bulk=True),
     protocol.UPLOAD_BEGIN: Operation(protocol.BeginRequest, protocol.UploadStatus, "write"),
     protocol.UPLOAD_CHUNK: Operation(protocol.UploadChunkRequest, protocol.Received, "write", "bytes", bulk=True),
     protocol.UPLOAD_COMMIT: Operation(protocol.CommitRequest, MapEntry, "write"),

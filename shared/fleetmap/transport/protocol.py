@@ -39,10 +39,11 @@ MAX_CHUNK_BYTES = 1024 * 1024  # that a server sends, whatever is asked for
 PROBLEM_ENCODING = "application/problem+json"
 PROBLEM_TYPE_PREFIX = "urn:fleetmap:problem:"
 MAX_TOKEN_BYTES = 1024
+MAP_SERVER, LOCALIZER = "fleetmap-server", "fleetmap-localizer"  # what says hello
 
 HELLO, ANNOUNCEMENTS = "hello", "announcements"
 MAPS, MAPS_ROLLBACK, MAPS_RETIRE = "maps", "maps/rollback", "maps/retire"
-MANIFEST, CHUNK = "manifest", "chunk"
+MANIFEST, CHUNK, LOCALIZE = "manifest", "chunk", "localize"
 UPLOAD_BEGIN, UPLOAD_CHUNK, UPLOAD_COMMIT = "upload/begin", "upload/chunk", "upload/commit"
 DRIVES_LIST, DRIVES_BEGIN, DRIVES_COMMIT = "drives/list", "drives/begin", "drives/commit"
 JOBS_LIST, JOBS_TAKE, JOBS_REPORT = "jobs/list", "jobs/take", "jobs/report"

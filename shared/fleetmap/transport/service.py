@@ -33,6 +33,7 @@ _SMALL_LANE = (8, 500)  # threads, and how many requests may wait for one
 _BULK_LANES = {
     protocol.CHUNK: (4, 1000),  # a request that waits holds next to nothing
     protocol.UPLOAD_CHUNK: (4, 48),  # each holds a chunk's bytes; the disk may be slow
+    protocol.LOCALIZE: (4, 12),  # each holds an image
 }
 
 _log = logging.getLogger(__name__)

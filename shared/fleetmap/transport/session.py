@@ -112,7 +112,7 @@ class Connection:
         for key in (*nearest, protocol.HELLO_KEY, protocol.ANY_VERSION_HELLO):
             left_s = deadline_s - time.monotonic()
             with suppress(NoAnswerError):
-                return self._get(key, {}, None, max(left_s, _LOOK_UP_S), bulk=False).answer()
+                return self._get(key, {}, None, max(left_s, _LOOK_UP_S), False, self.token).answer()
         raise NoAnswerError("no map server says hello")
 
     def watch(self, key_expression: str, notice: Callable[[bytes], None]) -> None:
@@ -134,12 +134,23 @@ class Connection:
         payload: bytes | None,
         timeout_s: float,
         bulk: bool = False,
+        token: str | None = None,
     ) -> Question:
-        """Send a request to the greeted server and return at once; ``bulk`` requests give way to small ones."""
-        return self._get(protocol.server_key(self.server_id, operation), parameters, payload, timeout_s, bulk)
+        """Send a request to the greeted server and return at once.
+
+        Those that are ``bulk`` give way to small ones; ``token`` goes with it in place of the connection's.
+        """
+        key = protocol.server_key(self.server_id, operation)
+        return self._get(key, parameters, payload, timeout_s, bulk, token or self.token)
 
     def _get(
-        self, key: str, parameters: Mapping[str, str], payload: bytes | None, timeout_s: float, bulk: bool
+        self,
+        key: str,
+        parameters: Mapping[str, str],
+        payload: bytes | None,
+        timeout_s: float,
+        bulk: bool,
+        token: str | None,
     ) -> Question:
         question = Question(self)
         if self.is_broken:
@@ -150,7 +161,7 @@ class Connection:
                 zenoh.Selector(key, zenoh.Parameters({name: quote(text) for name, text in parameters.items()})),
                 zenoh.handlers.Callback(question.take, question.end, indirect=False),
                 payload=payload,
-                attachment=self.token,
+                attachment=token,
                 timeout=timeout_s,
                 consolidation=zenoh.ConsolidationMode.NONE,
                 congestion_control=zenoh.CongestionControl.BLOCK,

@@ -5,10 +5,12 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 
 import pystac
@@ -17,9 +19,16 @@ import pytest
 import shapely
 
 from fleetmap.jobs import DriveSummary
+from fleetmap.transport import MapClient
+from fleetmap.transport.localizers import LocalizerPool
+from fleetmap_localizer.map_supply import WholeMaps
+from fleetmap_localizer.pose_service import PoseService
+from fleetmap_localizer.settings import LocalizerSettings
+from fleetmap_localizer.supplies import Supplies
 from fleetmap_server.http.app import create_app
 from fleetmap_server.library import open_library
 from fleetmap_server.settings import ServerSettings
+from fleetmap_server.zenoh_service import ZenohFace
 
 MAPS = 120  # more than one page
 START = datetime(2023, 11, 14, 22, 13, 20, tzinfo=UTC)  # of the surveys of all handmade maps
@@ -27,8 +36,15 @@ OFFLINE = Path(__file__).with_name("offline.py")
 
 
 @pytest.fixture(scope="module")
-def address(tmp_path_factory, make_map, publish, serving) -> Iterator[str]:
-    """A server with maps around the Earth, the first of them in three versions, and with a drive."""
+def locator_endpoint() -> str:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+@pytest.fixture(scope="module")
+def address(tmp_path_factory, make_map, publish, serving, module_endpoint, locator_endpoint) -> Iterator[str]:
+    """A server with maps around the Earth, the first of them in three versions, with a drive and a localizer."""
     with contextlib.ExitStack() as stack:
         library = stack.enter_context(open_library(ServerSettings(store=tmp_path_factory.mktemp("store"))))
         with library.storage.database.writing() as connection:
@@ -42,7 +58,12 @@ def address(tmp_path_factory, make_map, publish, serving) -> Iterator[str]:
                 library.catalogue.add(connection, one.manifest, one.version, len(one.manifest_bytes), None)
         for seed in range(3):  # last, so that it is what comes first in every list
             publish(library, make_map(map_id="map000", seed=seed, path_lonlat=((20.2, 20.2), (20.8, 20.8))))
-        yield stack.enter_context(serving(create_app(library)))
+        stack.enter_context(ZenohFace(library, module_endpoint))  # where the localizer asks who may ask it
+        supplies = Supplies(lambda camera, near: WholeMaps((), camera, LocalizerSettings()))
+        connect = partial(MapClient, module_endpoint)
+        stack.enter_context(PoseService(locator_endpoint, lambda token: connect(token=token), supplies))
+        pool = stack.enter_context(contextlib.closing(LocalizerPool([locator_endpoint])))
+        yield stack.enter_context(serving(create_app(library, localizers=pool)))
 
 
 def run(folder: Path, *arguments: str) -> str:
