@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Generator, Iterable, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,6 +15,9 @@ from fleetmap.covariances import PoseCovariances
 from fleetmap.drive import Frame
 from fleetmap.errors import FleetmapError, NoPoseError
 from fleetmap.trajectory import Trajectory
+from fleetmap.vision.features import FeatureExtractor, Features, FeatureSettings
+from fleetmap_localizer.dead_reckoning import DeadReckoning
+from fleetmap_localizer.feature_stream import with_features
 from fleetmap_localizer.localizer import Localizer
 from fleetmap_localizer.map_supply import MapSupply
 from fleetmap_localizer.pose_estimate import NoPose, PoseEstimate
@@ -108,6 +112,8 @@ def localize_drive(
     settings: LocalizerSettings | None = None,
     *,
     independent: bool = False,
+    reckoning: DeadReckoning | None = None,
+    looks_ahead: bool = True,
 ) -> LocalizedDrive:
     """Localise every image of a drive in the maps that lie around it.
 
@@ -119,22 +125,44 @@ def localize_drive(
         supply: of maps.
         settings: of the localizer.
         independent: every image is a query on its own, of which not even the supply learns.
+        reckoning: predicts poses where images give none.
+        looks_ahead: features of the next images are found meanwhile; not for frames that come when they are due.
     """
+    settings = settings or LocalizerSettings()
     localizer = Localizer(camera, (), settings)
+    find = with_features if looks_ahead else _features_when_due
     answers: list[PoseEstimate | NoPose] = []
     map_ids: dict[str, None] = {}
     ended_by: BaseException | None = None
     try:
         supply.views()  # waits for the first map, so that no image that is due has to
-        for frame in frames:
-            views = supply.views()
-            map_ids.update((view.map_id, None) for view in views)
-            localizer.use(views)
-            if independent:
-                localizer.forget()
-            answers.append(localizer.localize(frame))
-            if not independent:
-                supply.moved(answers[-1])
+        with closing(find(frames, camera, settings.features)) as images:
+            for frame, features in images:
+                localizer.use(views := supply.views())
+                map_ids.update((view.map_id, None) for view in views)
+                if independent:
+                    localizer.forget()
+                answer = localizer.localize_features(features, frame.stamp_ns)
+                answers.append(_with_prediction(answer, reckoning))
+                if not independent:
+                    supply.moved(answers[-1])
     except (FleetmapError, KeyboardInterrupt) as error:
         ended_by = error
     return LocalizedDrive(tuple(answers), tuple(map_ids), ended_by)
+
+
+def _features_when_due(
+    frames: Iterable[Frame], camera: Camera, settings: FeatureSettings
+) -> Generator[tuple[Frame, Features], None, None]:
+    extractor = FeatureExtractor(camera, settings)
+    for frame in frames:
+        yield frame, extractor.extract(frame.image)
+
+
+def _with_prediction(answer: PoseEstimate | NoPose, reckoning: DeadReckoning | None) -> PoseEstimate | NoPose:
+    """What the image gave; failing that, what other sensors say."""
+    if reckoning is None:
+        return answer
+    if isinstance(answer, PoseEstimate):
+        return reckoning.measured(answer)
+    return reckoning.pose_at(answer.stamp_ns) or answer

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
+from contextlib import closing
+from functools import partial
 from pathlib import Path
 
 import click
@@ -17,14 +18,13 @@ from fleetmap.read_ahead import read_ahead
 from fleetmap_cli.demo_processes import interrupted_once
 from fleetmap_cli.localization_report import PoseOutputs, finish
 from fleetmap_cli.options import LAT_LON, ServerAccess, optional_server_options
-from fleetmap_localizer.map_source import fetch_candidates, fetch_map, read_map
-from fleetmap_localizer.map_supply import WholeMaps
-from fleetmap_localizer.map_view import LocalizableMap
+from fleetmap_localizer.dead_reckoning import DeadReckoning
+from fleetmap_localizer.map_source import MapServer
 from fleetmap_localizer.paced import PacedFrames
-from fleetmap_localizer.part_cache import PartCache
 from fleetmap_localizer.pose_files import require_pose_file_name
 from fleetmap_localizer.run import localize_drive
 from fleetmap_localizer.settings import LocalizerSettings
+from fleetmap_localizer.tile_supply import map_supply_of
 
 _PATH = click.Path(path_type=Path)
 _FILE = click.Path(path_type=Path, dir_okay=False)
@@ -33,7 +33,7 @@ _IMAGES_AHEAD = 8  # decoded before they are due
 
 @click.command()
 @click.argument("recording", type=_PATH)
-@optional_server_options("Fetch the map from this map server, e.g. tcp/127.0.0.1:7447.")
+@optional_server_options("Fetch what is needed of the maps of this server, e.g. tcp/127.0.0.1:7447.")
 @click.option("--vehicle-id", metavar="NAME", help="With --server: the vehicle that it sees online meanwhile.")
 @click.option(
     "--map", "map_", metavar="ID|FOLDER", help="With --server: the map's id. Without: the folder of a map package."
@@ -58,10 +58,15 @@ _IMAGES_AHEAD = 8  # decoded before they are due
     "--with-predicted", is_flag=True, help="Have TUM files hold predicted poses too, which they cannot mark."
 )
 @click.option(
-    "--near", type=LAT_LON, help="With --server: choose among the maps within 1 km of here, nearest first."
+    "--near",
+    type=LAT_LON,
+    help="Where the drive begins, to some 300 m. Otherwise it may begin anywhere in the maps.",
 )
 @click.option(
-    "--use-gnss", is_flag=True, help="Take --near from the recording's first GNSS fix. Otherwise GNSS is not read."
+    "--use-gnss",
+    is_flag=True,
+    help="Take --near from the recording's first GNSS fix, and let fixes help to carry poses across gaps. "
+    "Otherwise GNSS is not read.",
 )
 @click.option(
     "--independent",
@@ -98,9 +103,13 @@ def localize(
 ) -> int | None:
     """Read the UTM pose of every image of RECORDING from the camera alone.
 
-    The map comes from a server (--server; verified and kept in a cache) or from a folder (--map). Without --map
-    and --near all maps of the server are looked into. An image that cannot be localised for sure gets no pose, and
-    its reason.
+    Maps come from a server (--server) or from a folder (--map). Of a server's maps only the 128 m tiles around
+    the vehicle are fetched, ahead of it as it moves, verified, and kept in a cache that works without the server;
+    newer versions are taken up as they are announced. Without --near every map is searched for the first pose. No
+    pose mixes two maps.
+
+    An image that cannot be localised for sure gets no pose, and a reason. Where the recording has an IMU or wheel
+    speeds, poses are carried across such gaps with growing uncertainty, and marked as predicted.
 
     What is written, whole or not at all, also when the run is interrupted:
 
@@ -127,13 +136,23 @@ def localize(
     _require_outputs(wanted)
     drive = open_drive(recording, image_topic=image_topic, gnss_topic=gnss_topic)
     camera, settings = drive.camera, LocalizerSettings()
-    if use_gnss and map_ is None and near is None:
+    if use_gnss and near is None:
         near = _first_fix(drive)
+    reckoning = None if independent else DeadReckoning.for_drive(drive, use_gnss=use_gnss)
     paced_frames = PacedFrames(read_ahead(drive.frames(), _IMAGES_AHEAD)) if paced else None
-    frames = _with_bar(paced_frames or drive.frames(), drive.frame_count)
-    with interrupted_once(), _maps(server, vehicle_id, map_, near, cache) as maps:
-        supply = WholeMaps(maps, camera, settings)
-        result = localize_drive(frames, camera, supply, settings, independent=independent)
+    # A vehicle does not wait for what lies ahead; a replay that is not paced would outrun the download.
+    origin = _origin(server, vehicle_id, map_)
+    supply = map_supply_of(origin, camera, settings, near_lat_lon_deg=near, cache=cache, in_step=not paced)
+    with interrupted_once(), closing(supply):
+        result = localize_drive(
+            _with_bar(paced_frames or drive.frames(), drive.frame_count),
+            camera,
+            supply,
+            settings,
+            independent=independent,
+            reckoning=reckoning,
+            looks_ahead=not paced,
+        )
     if paced_frames is not None:
         result = result.with_dropped(paced_frames.dropped_stamps_ns)
     return finish(wanted, result, paced_frames, drive.frame_count)
@@ -152,24 +171,12 @@ def _with_bar(frames: Iterable[Frame], count: int) -> Iterable[Frame]:
     return tqdm(frames, total=count, unit="image", desc="localize", file=sys.stderr, disable=None)
 
 
-@contextmanager
-def _maps(
-    server: ServerAccess,
-    vehicle_id: str | None,
-    map_: str | None,
-    near: tuple[float, float] | None,
-    cache: Path | None,
-) -> Iterator[Iterable[LocalizableMap]]:
-    if not server.is_given:
-        assert map_ is not None
-        yield [read_map(Path(map_))]
-        return
-    with server.connect(vehicle_id=vehicle_id) as client:
-        parts = PartCache(cache)
-        if map_ is not None:
-            yield [fetch_map(client, map_, None, parts)]
-        else:
-            yield fetch_candidates(client, near, parts)
+def _origin(server: ServerAccess, vehicle_id: str | None, map_: str | None) -> MapServer | Path:
+    """Where the maps come from: those of a server or one of them, or a folder."""
+    if server.is_given:
+        return MapServer(server.endpoint, partial(server.connect, vehicle_id=vehicle_id), map_)
+    assert map_ is not None
+    return Path(map_)
 
 
 def _first_fix(drive: Drive) -> tuple[float, float]:
