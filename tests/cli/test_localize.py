@@ -32,6 +32,8 @@ def test_help_teaches(fleetmap) -> None:
     assert code == 0
     for word in ("--server", "--map", "--near", "--use-gnss", "--cache", "Examples:", "GNSS is not read"):
         assert word in out
+    for word in ("--paced", "--independent", "--with-predicted", ".geojson", "foxglove.LocationFix", "EPSG:326xx"):
+        assert word in out
 
 
 def test_without_server_and_map_it_is_a_usage_error(fleetmap, recording, tmp_path) -> None:
@@ -40,10 +42,17 @@ def test_without_server_and_map_it_is_a_usage_error(fleetmap, recording, tmp_pat
     assert "--server ENDPOINT, or --map FOLDER" in err
 
 
-def test_without_trajectory_it_is_a_usage_error(fleetmap, recording, map_package) -> None:
+def test_without_anything_to_write_it_is_a_usage_error(fleetmap, recording, map_package) -> None:
     code, _, err = fleetmap("localize", recording, "--map", map_package)
     assert code == 2
-    assert "--trajectory" in err
+    assert "--trajectory OUT.tum, or --output" in err
+
+
+def test_an_ending_that_is_none_is_refused_before_any_work(fleetmap, recording, absent_server, tmp_path) -> None:
+    code, out, err = fleetmap("localize", recording, "--server", absent_server, "--output", tmp_path / "out.kml")
+    assert (code, out) == (2, "")
+    assert "must end in .tum, .csv, .geojson, .mcap" in err
+    assert err.count("\n") == 1
 
 
 @pytest.mark.parametrize("near", ["here", "48.1", "48.1,x", "48.1,11.5,3"])
@@ -107,19 +116,23 @@ def test_images_that_show_nothing_of_the_map_give_no_pose_and_no_file(
     rng = np.random.default_rng(0)
     images = [rng.uniform(0, 255, (200, 320)) if kind == "noise" else np.zeros((200, 320)) for _ in range(3)]
     path = record(tmp_path / "second.mcap", images)
-    code, out, err = fleetmap("localize", path, "--map", map_package, "--trajectory", tmp_path / "x.tum")
+    outputs = [word for name in ("x.geojson", "x.mcap", "x.csv") for word in ("--output", tmp_path / name)]
+    code, out, err = fleetmap("localize", path, "--map", map_package, "--trajectory", tmp_path / "x.tum", *outputs)
     assert (code, out) == (1, "")
     assert err.startswith("error: not one of 3 images could be localised")
     assert err.count("\n") == 1
-    assert not (tmp_path / "x.tum").exists()
+    assert [path.name for path in tmp_path.glob("x.*")] == ["x.csv"]
+    assert (tmp_path / "x.csv").read_text().count(",none,") == 3  # with the reasons
 
 
-def test_a_tampered_map_is_one_line(fleetmap, recording, map_package, tmp_path) -> None:
+def test_a_map_whose_tiles_are_all_tampered_with_gives_no_pose(fleetmap, recording, map_package, tmp_path) -> None:
     for part in (map_package / "parts").iterdir():
         data = bytearray(part.read_bytes())
         data[-1] ^= 1
         part.write_bytes(data)
     code, out, err = fleetmap("localize", recording, "--map", map_package, "--trajectory", tmp_path / "x.tum")
-    assert (code, out) == (2, "")
-    assert "damaged or was tampered with" in err
-    assert err.count("\n") == 1
+    assert (code, out) == (1, "")
+    assert not (tmp_path / "x.tum").exists()
+    *warnings, error = err.splitlines()
+    assert error.startswith("error: not one of 3 images could be localised")
+    assert all("damaged or was tampered with" in warning for warning in warnings)

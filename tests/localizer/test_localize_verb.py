@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -112,6 +114,34 @@ def test_covariances_are_written_beside_the_poses(
     assert 0.5 < consistency.pose.mean < 100.0
 
 
+def test_every_output_is_written_and_named(fleetmap: Run, second, mapped_street, second_drive, tmp_path) -> None:
+    names = ["out.csv", "out.geojson", "out.mcap", "out.tum"]
+    outputs = [word for name in names for word in ("--output", tmp_path / name)]
+    code, out, err = fleetmap("localize", second, "--map", mapped_street.package, "--independent", *outputs)
+    assert (code, err) == (0, "")
+    assert [line for line in out.splitlines() if line.startswith("written:")] == [
+        f"written:        {tmp_path / name}" for name in names
+    ]
+    assert_good(tmp_path / "out.tum", second_drive)
+    assert (tmp_path / "out.csv").read_text().count(",measured,") == 10
+    assert len(json.loads((tmp_path / "out.geojson").read_text())["features"]) == 11
+
+
+def test_a_paced_replay_tells_its_latencies(fleetmap: Run, second_drive, mapped_street, tmp_path) -> None:
+    """Four images, the last of them 0.3 s after the first; what a busy machine drops is named in the CSV."""
+    short = record(tmp_path / "short.mcap", second_drive, slice(0, 4), with_gnss=False)
+    table = tmp_path / "out.csv"
+    code, out, err = fleetmap("localize", short, "--map", mapped_street.package, "--paced", "--output", table)
+    assert (code, err) == (0, "")
+    told = re.search(r"latency: +median (\d+) ms, p95 (\d+) ms, max (\d+) ms; (\d) images dropped", out)
+    assert told is not None
+    median_ms, p95_ms, max_ms, dropped = map(int, told.groups())
+    assert 0 < median_ms <= p95_ms <= max_ms
+    lines = table.read_text().splitlines()
+    assert len(lines) == 5
+    assert sum("dropped" in line for line in lines) == dropped
+
+
 @pytest.mark.parametrize("how", ["only map", "map id", "near", "use gnss"])
 def test_a_server_gives_the_same_poses_as_the_folder(
     fleetmap: Run, server, second, mapped_street, second_drive, tmp_path, how
@@ -139,7 +169,7 @@ def test_another_street_gives_one_line_and_no_file(fleetmap: Run, foreign, mappe
     trajectory = tmp_path / "foreign.tum"
     code, out, err = fleetmap("localize", foreign, "--map", mapped_street.package, "--trajectory", trajectory)
     assert (code, out) == (1, "")
-    assert err.startswith("error: not one of 4 images could be localised in map 'street'")
+    assert err.startswith("error: not one of 4 images could be localised in 'street' (")
     assert err.count("\n") == 1
     assert not trajectory.exists()
 
