@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from fleetmap.catalogue import MapEntry
-from fleetmap.cells import CellIndex
+from fleetmap.cell import CellIndex
 from fleetmap.geodesy import UtmGrid
 from fleetmap.manifest import CELL_SIZE_M, Manifest, PartRecord
 

@@ -28,6 +28,7 @@ _CATALOGUE_MARGIN_M = 2000.0  # asked for around what is needed, so that it is s
 _GRID_METRES = 1.002  # at most so many metres on the ground are one on the grid
 
 _Records = dict[str, PartRecord]  # by hash
+_Choice = tuple[MapOffer, list[PartRecord]]  # a map, and its cells that matter
 
 
 @dataclass(frozen=True)
@@ -70,13 +71,14 @@ class Preparer:
         urgent: list[Wish] = []
         offers = self._offered(where, urgent)
         chosen = self._chosen(offers, look, where)
-        urgent += self._missing(chosen)
+        stand_ins = [self._ready_version(offer, records, look) for offer, records in chosen]
+        urgent += self._missing(chosen) + self._missing(each for each in stand_ins if each not in chosen)
         fetch = where.fetch_area()
         ahead = [] if fetch is None else self._chosen(offers, fetch, where)
         self._fetcher.wish([*urgent, *self._missing(ahead)])
         is_settled = not urgent or self._fetcher.is_away
         if is_settled or not where.is_searching:
-            pieces = [self._piece(offer, records, look) for offer, records in chosen]
+            pieces = [self._newest_piece(offer, records, look) for offer, records in chosen]
             self._pieces = {piece.offer.entry.map_id: piece for piece in pieces if piece is not None}
             wanted = {record.sha256 for _, records in (*chosen, *ahead) for record in records}
             self._shelf.keep_only(wanted.union(*(piece.cells for piece in self._pieces.values())))
@@ -116,9 +118,7 @@ class Preparer:
         self._offers = {offer.version: offer for offer in offers}
         return offers
 
-    def _chosen(
-        self, offers: Sequence[MapOffer], area: Area | None, where: Whereabouts
-    ) -> list[tuple[MapOffer, list[PartRecord]]]:
+    def _chosen(self, offers: Sequence[MapOffer], area: Area | None, where: Whereabouts) -> list[_Choice]:
         """The maps to look into, with their cells in the area; where none is to be had, those that are in use."""
         around = {offer.version: _cells_in(area, offer) for offer in offers}
         shown = [(offer, offer.ways(around[offer.version])) for offer in offers if around[offer.version]]
@@ -128,22 +128,18 @@ class Preparer:
             chosen += [offer for offer, _ in shown if offer not in chosen][: max_count - len(chosen)]
         if not chosen:
             chosen = [piece.offer for piece in self._pieces.values()]
-        ready = [self._ready_version(offer, area) for offer in chosen]
-        return self._cut_short(ready)
+        return self._cut_short([(offer, _cells_in(area, offer)) for offer in chosen])
 
-    def _ready_version(self, offer: MapOffer, area: Area | None) -> tuple[MapOffer, list[PartRecord]]:
+    def _ready_version(self, offer: MapOffer, records: list[PartRecord], look: Area | None) -> _Choice:
         """The version in use until all of the next one's cells around are there."""
-        records = _cells_in(area, offer)
         piece = self._pieces.get(offer.entry.map_id)
         if piece is None or piece.offer.version == offer.version or all(map(self._is_readable, records)):
             return offer, records
-        return piece.offer, _cells_in(area, piece.offer)
+        return piece.offer, _cells_in(look, piece.offer)
 
-    def _cut_short(
-        self, chosen: Iterable[tuple[MapOffer, list[PartRecord]]]
-    ) -> list[tuple[MapOffer, list[PartRecord]]]:
+    def _cut_short(self, chosen: Iterable[_Choice]) -> list[_Choice]:
         """As much as may be ready at once."""
-        kept, left_bytes = list[tuple[MapOffer, list[PartRecord]]](), self._window.max_bytes
+        kept, left_bytes = list[_Choice](), self._window.max_bytes
         for offer, records in chosen:
             left_bytes -= sum(record.size_bytes for record in records)
             if left_bytes < 0 and kept:
@@ -161,7 +157,7 @@ class Preparer:
             )
         self._is_cut_short = True
 
-    def _missing(self, chosen: Iterable[tuple[MapOffer, list[PartRecord]]]) -> list[Wish]:
+    def _missing(self, chosen: Iterable[_Choice]) -> list[Wish]:
         """What is to be fetched for some cells of maps."""
         wishes = list[Wish]()
         for offer, records in chosen:
@@ -178,6 +174,13 @@ class Preparer:
     def _is_readable(self, record: PartRecord) -> bool:
         is_here = self._shelf.part(record.sha256, record.size_bytes) is not None
         return is_here and record.sha256 not in self._unreadable
+
+    def _newest_piece(self, offer: MapOffer, records: list[PartRecord], look: Area | None) -> _Piece | None:
+        """The piece of the newest version that is whole."""
+        version = self._ready_version(offer, records, look)
+        piece = self._piece(*version, look)
+        again = self._ready_version(offer, records, look)  # by now it is known what cannot be read
+        return piece if again[0] is version[0] else self._piece(*again, look)
 
     def _piece(self, offer: MapOffer, records: Sequence[PartRecord], look: Area | None) -> _Piece | None:
         """The view of what can be read of some cells: the one before if it shows them, and not much more."""

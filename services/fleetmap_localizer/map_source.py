@@ -71,15 +71,16 @@ class MapServer:
     """A map server, and how to connect to it."""
 
     endpoint: str
-    connect: Callable[[], MapClient]
+    connect: Callable[..., MapClient]  # takes MapClient's ``patience_s``
     map_id: str | None = None  # the only map wanted from there
+    patience_s: float = 5.0  # without an answer for longer, it counts as away; it is asked again later
 
     def __str__(self) -> str:
         return f"map server {self.endpoint}"
 
     def open(self) -> ServerMaps:
         """Connect; raises as MapClient does."""
-        return ServerMaps(self.connect(), self.map_id)
+        return ServerMaps(self.connect(patience_s=self.patience_s), self.map_id)
 
 
 @dataclass(frozen=True)

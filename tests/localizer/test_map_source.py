@@ -1,114 +1,109 @@
-"""Maps from a folder and from a real server: the same map, verified and kept."""
+"""A folder and a real server give the same maps."""
 
 from __future__ import annotations
 
-import json
 import shutil
 import socket
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from fleetmap.errors import MapPackageError, NoPoseError, ServerRefusedError
-from fleetmap.manifest import manifest_version
+from fleetmap.errors import MapPackageError, ServerError, ServerRefusedError
 from fleetmap.map_package import open_package
 from fleetmap.transport import MapClient
-from fleetmap_localizer.map_source import fetch_candidates, fetch_map, read_map
-from fleetmap_localizer.map_view import LocalizableMap
-from fleetmap_localizer.part_cache import PartCache
+from fleetmap_localizer.map_source import Circle, FolderMap, MapFolder, MapServer, MapSource, ServerMaps, read_map
 from fleetmap_server.server import running_server
 from fleetmap_server.settings import ServerSettings
 
 
 @pytest.fixture(scope="module")
-def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[MapClient]:
-    """A client of a server that has nothing yet."""
+def endpoint(mapped_street, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """A server with the map of the street."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
     store = tmp_path_factory.mktemp("server") / "store"
     with running_server(ServerSettings(store, endpoint, http_port=0)), MapClient(endpoint) as client:
-        yield client
-
-
-@pytest.fixture(scope="module")
-def published(client: MapClient, mapped_street, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of the street's map, which the server has, and an older one of another name beside it."""
-    older = Path(shutil.copytree(mapped_street.package, tmp_path_factory.mktemp("older") / "older"))
-    manifest = json.loads((older / "manifest.json").read_bytes())
-    (older / "manifest.json").write_text(json.dumps(manifest | {"map_id": "older"}))
-    for folder in (older, mapped_street.package):
-        package = open_package(folder)
+        package = open_package(mapped_street.package)
         client.publish(package.manifest_bytes, package.part_bytes)
-    return mapped_street.package
+        yield endpoint
 
 
-def assert_same(first: LocalizableMap, second: LocalizableMap) -> None:
-    assert (first.map_id, first.version, first.camera) == (second.map_id, second.version, second.camera)
-    for group in ("keyframes", "landmarks"):
-        for name, values in vars(getattr(first.content, group)).items():
-            assert np.array_equal(values, getattr(getattr(second.content, group), name)), name
-    assert np.array_equal(first.content.seen_landmark, second.content.seen_landmark)
+@pytest.fixture
+def server(endpoint: str) -> Iterator[ServerMaps]:
+    source = MapServer(endpoint, lambda **how: MapClient(endpoint, **how)).open()
+    yield source
+    source.close()
 
 
-def test_a_server_without_maps_is_told_apart(client: MapClient, tmp_path: Path) -> None:  # so it comes first
-    with pytest.raises(NoPoseError, match=r"has no map; 'fleetmap maps list"):
-        next(fetch_candidates(client, None, PartCache(tmp_path)))
+@pytest.fixture
+def folder(mapped_street) -> FolderMap:
+    return MapFolder(mapped_street.package).open()
 
 
-def test_a_fetched_map_equals_the_one_on_disk(client: MapClient, published: Path, tmp_path: Path) -> None:
-    assert_same(fetch_map(client, "street", None, PartCache(tmp_path)), read_map(published))
+def test_both_give_the_same_bytes(server: ServerMaps, folder: FolderMap, mapped_street) -> None:
+    version = open_package(mapped_street.package).version
+    cells = {part.sha256: part.size_bytes for part in mapped_street.manifest.parts if part.kind == "cell"}
 
+    def all_of(source: MapSource) -> tuple[bytes, list[bytes]]:
+        return source.manifest("street", version), list(source.parts("street", version, cells))
 
-def test_only_cells_are_fetched_and_only_once(client: MapClient, published: Path, tmp_path: Path) -> None:
-    cells = {record.sha256 for record in open_package(published).manifest.parts if record.kind == "cell"}
     assert cells
-    fetch_map(client, "street", None, PartCache(tmp_path))
-    kept = {file.stem: file.stat().st_mtime_ns for file in tmp_path.iterdir()}
-    assert set(kept) == cells
-    fetch_map(client, "street", None, PartCache(tmp_path))
-    assert {file.stem: file.stat().st_mtime_ns for file in tmp_path.iterdir()} == kept
+    assert all_of(server) == all_of(folder)
+    assert server.is_served("street", version)
+    assert folder.is_served("street", version)
 
 
-def test_a_tampered_cache_does_not_reach_the_localizer(client: MapClient, published: Path, tmp_path: Path) -> None:
-    fetch_map(client, "street", None, PartCache(tmp_path))
-    victim = sorted(tmp_path.iterdir())[0]
-    data = bytearray(victim.read_bytes())
-    data[len(data) // 2] ^= 1
-    victim.write_bytes(data)
-    assert_same(fetch_map(client, "street", None, PartCache(tmp_path)), read_map(published))
-    assert victim.read_bytes() != bytes(data)
+def test_maps_are_found_where_they_are(server: ServerMaps, folder: FolderMap, mapped_street) -> None:
+    lon, lat = mapped_street.manifest.trajectory_lonlat[0]
+    for source in (server, folder):
+        for around in (None, Circle(lat, lon, 100.0), Circle(lat + 0.01, lon, 1200.0)):
+            (entry,) = source.maps(around, 10)
+            assert (entry.map_id, entry.version) == ("street", open_package(mapped_street.package).version)
+        assert source.maps(Circle(lat + 0.01, lon, 1000.0), 10) == []
 
 
-def test_candidates_come_newest_first_and_nearest_only_where_near(
-    client: MapClient, published: Path, tmp_path: Path
-) -> None:
-    cache = PartCache(tmp_path)
-    assert [candidate.map_id for candidate in fetch_candidates(client, None, cache)] == ["street", "older"]
-    lon, lat = open_package(published).manifest.trajectory_lonlat[0]
-    near = {candidate.map_id for candidate in fetch_candidates(client, (lat, lon), cache)}
-    assert near == {"street", "older"}
-    with pytest.raises(NoPoseError, match=r"no map near 40\.000000,-3\.000000"):
-        next(fetch_candidates(client, (40.0, -3.0), cache))
+def test_a_circle_encloses_another_that_touches_it_from_within() -> None:
+    outer = Circle(48.0, 11.0, 2000.0)
+    assert outer.encloses(Circle(48.0, 11.0, 2000.0))
+    assert outer.encloses(Circle(48.01, 11.0, 880.0))  # 1112 m away
+    assert not outer.encloses(Circle(48.01, 11.0, 900.0))
+    assert outer.widened(20.0).encloses(Circle(48.01, 11.0, 900.0))
 
 
-def test_an_older_version_can_be_named_and_a_missing_map_is_refused(
-    client: MapClient, published: Path, tmp_path: Path
-) -> None:
-    version = manifest_version((published / "manifest.json").read_bytes())
-    assert fetch_map(client, "street", version, PartCache(tmp_path)).version == version
+def test_the_only_map_that_is_wanted_is_found_wherever_it_is(endpoint: str) -> None:
+    def opened(map_id: str) -> ServerMaps:
+        return MapServer(endpoint, lambda **how: MapClient(endpoint, **how), map_id).open()
+
+    wanted = opened("street")
+    assert [entry.map_id for entry in wanted.maps(Circle(0.0, 0.0, 1.0), 10)] == ["street"]
+    wanted.close()
+    missing = opened("atlantis")
     with pytest.raises(ServerRefusedError, match="atlantis"):
-        fetch_map(client, "atlantis", None, PartCache(tmp_path))
+        missing.maps(None, 10)
+    missing.close()
 
 
-def test_a_tampered_part_on_disk_is_refused(published: Path, tmp_path: Path) -> None:
-    folder = Path(shutil.copytree(published, tmp_path / "street"))
+def test_a_version_that_nobody_has_is_refused_and_not_served(server: ServerMaps) -> None:
+    with pytest.raises(ServerRefusedError):
+        server.manifest("street", "0" * 64)
+    assert not server.is_served("street", "0" * 64)
+
+
+def test_a_closed_server_is_one_that_is_away(endpoint: str) -> None:
+    source = MapServer(endpoint, lambda **how: MapClient(endpoint, **how)).open()
+    source.close()
+    with pytest.raises(ServerError):
+        source.maps(None, 10)
+
+
+def test_a_tampered_part_on_disk_is_refused(mapped_street, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(mapped_street.package, tmp_path / "street"))
     cell = next(record for record in open_package(folder).manifest.parts if record.kind == "cell")
     path = folder / "parts" / f"{cell.sha256}.bin"
-    data = bytearray(path.read_bytes())
-    data[-1] ^= 1
-    path.write_bytes(data)
+    path.write_bytes(path.read_bytes()[:-1] + b"!")
     with pytest.raises(MapPackageError, match=cell.sha256):
         read_map(folder)
+    with pytest.raises(MapPackageError, match=cell.sha256):
+        list(MapFolder(folder).open().parts("street", "", {cell.sha256: cell.size_bytes}))
