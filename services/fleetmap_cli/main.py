@@ -1,6 +1,7 @@
 """The ``fleetmap`` command: finds the verb, imports it lazily, and turns errors into one line and an exit code.
 
-Exit codes: 0 done; 1 failed while running; 2 bad input or usage; 3 a map was written, but not fit to publish.
+Exit codes: 0 done; 1 failed while running; 2 bad input or usage; 3 a map was written, but not fit to publish;
+4 an image was looked at, but it shows no place for sure.
 """
 
 from __future__ import annotations
@@ -40,12 +41,15 @@ VERBS: dict[str, tuple[str, str, str]] = {
         "Read a vehicle's UTM pose from its camera, frame by frame.",
         "localizer",
     ),
+    "locate": ("locate:locate", "Say where single images were taken.", "localizer"),
+    "locator": ("locator:locator", "Say where images were taken, as a service.", "localizer"),
     "evaluate": ("evaluate:evaluate", "Judge a trajectory against a reference or a map.", "all"),
     "benchmark": ("benchmark:benchmark", "Measure a part and write table, figures and pictures.", "all"),
 }
 
 _EPILOG = (
-    "Exit codes: 0 done; 1 failed while running; 2 bad input or usage; 3 map written, but not fit to publish."
+    "Exit codes: 0 done; 1 failed while running; 2 bad input or usage; 3 map written, but not fit to publish; "
+    "4 no pose for an image (locate)."
 )
 
 
