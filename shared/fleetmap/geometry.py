@@ -119,7 +119,7 @@ def nearest_rotations(matrices: Array) -> Array:
 def so3_exp(rotation_vectors_rad: Array) -> Array:
     """Rotation matrices (..., 3, 3) of rotation vectors (..., 3)."""
     vectors = np.asarray(rotation_vectors_rad, dtype=np.float64)
-    angles = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    angles = np.sqrt((vectors * vectors).sum(axis=-1, keepdims=True))
     is_small = angles < _SMALL_RAD
     per_rad = np.where(is_small, 0.5 - angles**2 / 48.0, np.sin(angles / 2.0) / np.where(is_small, 1.0, angles))
     return rotations_from_quat_xyzw(np.concatenate([per_rad * vectors, np.cos(angles / 2.0)], axis=-1))
@@ -128,7 +128,7 @@ def so3_exp(rotation_vectors_rad: Array) -> Array:
 def so3_log(rotations: Array) -> Array:
     """Rotation vectors (..., 3) in rad of rotation matrices (..., 3, 3)."""
     quat_xyzw = quat_xyzw_from_rotations(rotations)
-    sines = np.linalg.norm(quat_xyzw[..., :3], axis=-1, keepdims=True)
+    sines = np.sqrt((quat_xyzw[..., :3] ** 2).sum(axis=-1, keepdims=True))
     is_small = sines < _SMALL_RAD
     angles = 2.0 * np.arctan2(sines, quat_xyzw[..., 3:])
     rad_per = np.where(is_small, 2.0 + sines**2 / 3.0, angles / np.where(is_small, 1.0, sines))
@@ -147,16 +147,12 @@ def rotations_from_quat_xyzw(quat_xyzw: Array) -> Array:
         InputError: one has no length.
     """
     quat = np.asarray(quat_xyzw, dtype=np.float64)
-    lengths = np.linalg.norm(quat, axis=-1, keepdims=True)
+    lengths = np.sqrt((quat * quat).sum(axis=-1, keepdims=True))
     if not np.all(lengths > 0.0):
         raise InputError("a quaternion of length zero turns nothing anywhere")
-    x, y, z, w = np.moveaxis(quat / lengths, -1, 0)
-    elements = [
-        [x * x - y * y - z * z + w * w, 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)],
-        [2.0 * (x * y + z * w), -x * x + y * y - z * z + w * w, 2.0 * (y * z - x * w)],
-        [2.0 * (x * z - y * w), 2.0 * (y * z + x * w), -x * x - y * y + z * z + w * w],
-    ]
-    return np.moveaxis(np.array(elements), (0, 1), (-2, -1))
+    quat = quat / lengths
+    products = (quat[..., :, None] * quat[..., None, :]).reshape(*quat.shape[:-1], 16)
+    return np.asarray((products @ _QUATERNION_PRODUCTS.T).reshape(*quat.shape[:-1], 3, 3))
 
 
 def quat_xyzw_from_rotations(rotations: Array) -> Array:
@@ -165,22 +161,11 @@ def quat_xyzw_from_rotations(rotations: Array) -> Array:
     4 q q^T follows from the matrix without a root; its row with the largest square has the least rounding error.
     Source: S. W. Shepperd, "Quaternion from rotation matrix", J. Guidance and Control 1(3), 1978.
     """
-    R = np.moveaxis(np.asarray(rotations, dtype=np.float64), (-2, -1), (0, 1))
-    xx, yy, zz = R[0, 0], R[1, 1], R[2, 2]
-    xy, xz, yz = R[1, 0] + R[0, 1], R[0, 2] + R[2, 0], R[2, 1] + R[1, 2]
-    xw, yw, zw = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
-    rows = np.array(
-        [
-            [1.0 + xx - yy - zz, xy, xz, xw],
-            [xy, 1.0 - xx + yy - zz, yz, yw],
-            [xz, yz, 1.0 - xx - yy + zz, zw],
-            [xw, yw, zw, 1.0 + xx + yy + zz],
-        ]
-    )
-    rows = np.moveaxis(rows, (0, 1), (-2, -1))
-    squares = np.diagonal(rows, axis1=-2, axis2=-1)
-    quat = np.take_along_axis(rows, np.argmax(squares, axis=-1)[..., None, None], axis=-2)[..., 0, :]
-    quat = quat / np.linalg.norm(quat, axis=-1, keepdims=True)
+    R = np.asarray(rotations, dtype=np.float64)
+    products = np.eye(4) + (R.reshape(*R.shape[:-2], 9) @ _QUATERNION_PRODUCTS).reshape(*R.shape[:-2], 4, 4)
+    largest = np.argmax(np.diagonal(products, axis1=-2, axis2=-1), axis=-1)
+    quat = np.take_along_axis(products, largest[..., None, None], axis=-2)[..., 0, :]
+    quat = quat / np.sqrt((quat * quat).sum(axis=-1, keepdims=True))
     return np.asarray(np.where(quat[..., 3:] < 0.0, -quat, quat))
 
 
@@ -189,3 +174,17 @@ def interpolate_pose(first: Pose, second: Pose, fraction: float) -> Pose:
     turn = so3_exp(fraction * so3_log(first.rotation.T @ second.rotation))
     translation_m = (1.0 - fraction) * first.translation_m + fraction * second.translation_m
     return Pose(first.rotation @ turn, translation_m)
+
+
+def _quaternion_products() -> Array:
+    """C (9, 16): the elements of R are C vec(q q^T), and vec(4 q q^T) = vec(I) + C^T vec(R)."""
+    w = 3
+    C = np.zeros((3, 3, 4, 4))
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        C[i, i] = np.diag([1.0 if a in (i, w) else -1.0 for a in range(4)])
+        C[i, j, [i, j], [j, i]] = C[j, i, [i, j], [j, i]] = 1.0
+        C[i, j, [k, w], [w, k]], C[j, i, [k, w], [w, k]] = -1.0, 1.0
+    return C.reshape(9, 16)
+
+
+_QUATERNION_PRODUCTS = _quaternion_products()

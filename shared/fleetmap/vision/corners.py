@@ -31,9 +31,10 @@ class Corners:
 
 def corner_scores(image: GreyImage) -> NDArray[np.uint8]:
     """The score (H, W) uint8 of every pixel of a grey image (H, W); without meaning 3 pixels from its border."""
-    scores = np.zeros(image.shape, dtype=np.uint8)
-    if min(image.shape) >= 7:
-        _score_all(image.ravel(), image.shape[1], scores.ravel())
+    if min(image.shape) < 7:
+        return np.zeros(image.shape, dtype=np.uint8)
+    scores = np.empty(image.shape, dtype=np.uint8)
+    _score_all(image.ravel(), image.shape[1], scores.ravel())
     return scores
 
 
