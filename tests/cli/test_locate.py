@@ -1,4 +1,4 @@
-"""``fleetmap locate`` and ``locator``: what they refuse, in one line. What they find is tested with the localizer."""
+"""``fleetmap locate`` and ``locator``: what they refuse, in one line. Poses are tested with the localizer."""
 
 from __future__ import annotations
 
