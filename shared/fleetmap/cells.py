@@ -31,21 +31,34 @@ _READERS = {"1": read_early_cell, "2": read_compact_cell}
 Group = TypeVar("Group", Keyframes, Landmarks)
 
 
-def split_into_cells(visual_map: VisualMap) -> dict[CellIndex, Cell]:
-    """The cells of a map that hold keyframes, in order of their index."""
-    cells, cell_of_keyframe = cells_of_keyframes(visual_map)
-    cell_of_observation = cell_of_keyframe[visual_map.observations.keyframe_index]
-    by_cell = np.argsort(cell_of_observation, kind="stable")
-    borders = np.searchsorted(cell_of_observation[by_cell], np.arange(1, len(cells)))
+def whole_map(visual_map: VisualMap) -> LocalizationMap:
+    """All keyframes and landmarks, and all that was observed."""
+    observations = visual_map.observations
+    pairs = np.unique(observations.keyframe_index.astype(np.int64) << 32 | observations.landmark_index)
+    return LocalizationMap(
+        visual_map.anchor,
+        visual_map.keyframes,
+        visual_map.landmarks,
+        (pairs >> 32).astype(np.int32),
+        (pairs & 0xFFFFFFFF).astype(np.int32),
+    )
+
+
+def split_into_cells(content: LocalizationMap) -> dict[CellIndex, Cell]:
+    """The cells that hold keyframes, in order of their index."""
+    cells, cell_of_keyframe = cells_of_keyframes(content)
+    cell_of_pair = cell_of_keyframe[content.seen_by_keyframe]
+    by_cell = np.argsort(cell_of_pair, kind="stable")
+    borders = np.searchsorted(cell_of_pair[by_cell], np.arange(1, len(cells)))
     return {
-        (int(east), int(north)): _cut_out(visual_map, np.flatnonzero(cell_of_keyframe == number), observed)
-        for number, ((east, north), observed) in enumerate(zip(cells, np.split(by_cell, borders), strict=True))
+        (int(east), int(north)): _cut_out(content, np.flatnonzero(cell_of_keyframe == number), seen)
+        for number, ((east, north), seen) in enumerate(zip(cells, np.split(by_cell, borders), strict=True))
     }
 
 
-def cells_of_keyframes(visual_map: VisualMap) -> tuple[Ids, Ids]:
+def cells_of_keyframes(content: VisualMap | LocalizationMap) -> tuple[Ids, Ids]:
     """The indices (C, 2) of the cells that hold keyframes, and which of them each keyframe (K,) lies in."""
-    in_utm = visual_map.anchor.utm_from_map(visual_map.keyframes.positions_m)
+    in_utm = content.anchor.utm_from_map(content.keyframes.positions_m)
     cells, cell_of_keyframe = np.unique(
         np.floor(in_utm[:, :2] / CELL_SIZE_M).astype(np.int64), axis=0, return_inverse=True
     )
@@ -108,18 +121,15 @@ def merge_cells(anchor: UtmAnchor, cells: Sequence[Cell]) -> LocalizationMap:
     )
 
 
-def _cut_out(visual_map: VisualMap, keyframe_ids: Ids, observed: Ids) -> Cell:
-    """The cell of these keyframes and of their observations ``observed``."""
-    landmark_index = visual_map.observations.landmark_index[observed].astype(np.int64)
-    keyframe_index = visual_map.observations.keyframe_index[observed].astype(np.int64)
-    pairs = np.unique(keyframe_index << 32 | landmark_index)  # sorted by keyframe, then landmark
-    landmark_ids, seen_landmark = np.unique(pairs & 0xFFFFFFFF, return_inverse=True)
+def _cut_out(content: LocalizationMap, keyframe_ids: Ids, pairs: Ids) -> Cell:
+    """The cell of these keyframes and of what they see, which is the ``pairs`` (m,) of the map's."""
+    landmark_ids, seen_landmark = np.unique(content.seen_landmark[pairs].astype(np.int64), return_inverse=True)
     return Cell(
         keyframe_ids,
-        taken(visual_map.keyframes, keyframe_ids),
+        taken(content.keyframes, keyframe_ids),
         landmark_ids,
-        taken(visual_map.landmarks, landmark_ids),
-        np.searchsorted(keyframe_ids, pairs >> 32),
+        taken(content.landmarks, landmark_ids),
+        np.searchsorted(keyframe_ids, content.seen_by_keyframe[pairs]),
         seen_landmark,
     )
 

@@ -16,10 +16,12 @@ from where that of the landmark before begins, its others from where the run bef
 negative are stored as 2 n or -2 n - 1 (zigzag), so that small ones keep their upper bytes 0.
 
 Positions count from the cell's south-west corner at ellipsoidal height 0: keyframes in millimetres, landmarks in
-steps of 1 to 1,024 mm, the largest power of two that is at most a quarter of the standard deviation across.
-Rounding to it adds less than 1 % to the variance, and since every step divides 128 m, a landmark reads the same
-from every cell that holds it. Distances and sigmas are logarithmic (see fleetmap.log_bytes): within 2 %, and up to
-6 % too large, never too small. Normals are rounded to 360/256 degrees, twice; orientations to 1e-5 rad.
+steps of 8 to 1,024 mm, the largest power of two that is at most a quarter of the standard deviation across. 8 mm
+are a quarter of a pixel at 30 m; what rounding to them errs, 2.3 mm, is part of the deviations that are stored.
+Rounding to more adds less than 1 % to the variance. Since every step divides 128 m, a landmark reads the same from
+every cell that holds it. Distances and deviations are logarithmic (see fleetmap.log_bytes): within 2 %, and up to
+8 % too large, never too small. Normals are rounded to 360/256 degrees, twice; orientations to 1e-5 rad. Where no
+deviations are known, positions are rounded to a millimetre.
 """
 
 from __future__ import annotations
@@ -41,9 +43,10 @@ MAX_PAIRS = 16 * 1024 * 1024  # of keyframe and landmark in a cell
 _QUATERNION_UNITS = 200_000.0
 _UNIT_TOLERANCE = 1e-3
 _DISTANCES_M = LogBytes(0.1, 0.04)  # 0.1 m to 2.7 km
-SIGMAS_M = LogBytes(5e-4, 0.06)  # 0.5 mm to 2.2 km
+_ROUNDING_M = 8e-3 / 12.0**0.5  # standard deviation
+SIGMAS_M = LogBytes(_ROUNDING_M, 0.08)
 _STEPS_PER_SIGMA = 4.0
-_MAX_SHIFT = 10
+_MIN_SHIFT, _MAX_SHIFT = 3, 10
 _UNITS_PER_RAD = 256.0 / (2.0 * np.pi)
 
 
@@ -61,7 +64,7 @@ def compact_arrays(cell: Cell, offset_m: NDArray[np.float64]) -> dict[str, NDArr
     if keyframes.covariances is not None:
         stored = covariances_to_bytes(keyframes.covariances)
         arrays["keyframe_covariances"] = np.diff(stored, prepend=np.uint8(0)).astype("|u1")
-    sigmas = None if landmarks.sigmas_m is None else SIGMAS_M.at_least(landmarks.sigmas_m).T
+    sigmas = None if landmarks.sigmas_m is None else SIGMAS_M.at_least(np.hypot(landmarks.sigmas_m, _ROUNDING_M)).T
     in_cell_mm = np.rint(landmarks.points_m * MM_PER_M).T - np.rint(offset_m * MM_PER_M)[:, None]
     step_mm = 2.0 ** _shifts(sigmas)
     steps = np.floor(in_cell_mm / step_mm + 0.5).astype(np.int64)  # rint would round halves by the cell's number
@@ -205,7 +208,7 @@ def _shifts(sigmas: NDArray[np.uint8] | None) -> NDArray[np.int64]:
     if sigmas is None:
         return np.zeros(1, np.int64)
     across_mm = SIGMAS_M.values(np.arange(256, dtype=np.uint8)) * MM_PER_M
-    table = np.floor(np.log2(across_mm / _STEPS_PER_SIGMA) + 1e-9).clip(0, _MAX_SHIFT).astype(np.int64)
+    table = np.floor(np.log2(across_mm / _STEPS_PER_SIGMA) + 1e-9).clip(_MIN_SHIFT, _MAX_SHIFT).astype(np.int64)
     return np.asarray(table[sigmas[0]])
 
 

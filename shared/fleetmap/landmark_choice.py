@@ -14,22 +14,21 @@ functions", 1978; M. Minoux, "Accelerated greedy algorithms", 1978.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.cells import cells_of_keyframes
+from fleetmap.cells import cells_of_keyframes, whole_map
 from fleetmap.errors import MapPackageError
 from fleetmap.greedy_choice import Views, order_of_use
 from fleetmap.keyframe_thinning import thinned_keyframes
 from fleetmap.landmark_chances import landmark_chances
-from fleetmap.landmark_precision import SCALE_FACTOR, landmark_sigmas_m
+from fleetmap.landmark_precision import SCALE_FACTOR, with_precision
 from fleetmap.manifest import Manifest
 from fleetmap.map_package import MapPackage, write_package
 from fleetmap.package_encoding import cell_parts
-from fleetmap.visual_map import VisualMap, taken
+from fleetmap.visual_map import LocalizationMap, VisualMap, taken
 
 Array = NDArray[np.float64]
 Ids = NDArray[np.int64]
@@ -41,9 +40,10 @@ _USUAL_BYTES = 42.0  # per landmark and cell
 _CLOSE_ENOUGH = 0.98  # of the budget
 _MAX_TRIALS = 8
 _LEAST_LENGTH_KM = 0.1
+_GAP = 4  # keyframes
 
 
-def choose_for_localizing(visual_map: VisualMap, budget_mb_per_km: float) -> VisualMap:
+def choose_for_localizing(visual_map: VisualMap, budget_mb_per_km: float) -> LocalizationMap:
     """The keyframes and landmarks whose cells take at most so many megabytes per kilometre of keyframes' way.
 
     A landmark in two cells counts twice; of ways below 100 m, 100 m count. Landmarks are numbered anew, by where
@@ -53,11 +53,10 @@ def choose_for_localizing(visual_map: VisualMap, budget_mb_per_km: float) -> Vis
         MapPackageError: the keyframes alone take more.
     """
     limit_bytes = budget_mb_per_km * BYTES_PER_MB * max(_length_km(visual_map), _LEAST_LENGTH_KM)
-    landmarks = replace(visual_map.landmarks, sigmas_m=landmark_sigmas_m(visual_map))
-    thin = thinned_keyframes(replace(visual_map, landmarks=landmarks))
+    thin = thinned_keyframes(with_precision(visual_map))
     order = _in_order_of_use(thin)
     count, low, high = min(int(limit_bytes / _USUAL_BYTES), len(order)), 0, len(order)
-    best: VisualMap | None = None
+    best: LocalizationMap | None = None
     for _ in range(_MAX_TRIALS):
         trial = only_landmarks(thin, order[:count])
         size_bytes = sum(len(data) for data, _ in cell_parts(trial).values())
@@ -76,13 +75,15 @@ def choose_for_localizing(visual_map: VisualMap, budget_mb_per_km: float) -> Vis
     return best
 
 
-def localizable_part(visual_map: VisualMap, budget_mb_per_km: float) -> VisualMap:
+def localizable_part(visual_map: VisualMap, budget_mb_per_km: float) -> LocalizationMap:
     """What goes into the cells: ``choose_for_localizing``, or the whole map where the budget is 0.
 
     Raises:
         MapPackageError: the keyframes alone take more.
     """
-    return choose_for_localizing(visual_map, budget_mb_per_km) if budget_mb_per_km > 0.0 else visual_map
+    if budget_mb_per_km > 0.0:
+        return choose_for_localizing(visual_map, budget_mb_per_km)
+    return whole_map(with_precision(visual_map))
 
 
 def choose_again(package: MapPackage, folder: Path, budget_mb_per_km: float, *, force: bool = False) -> Manifest:
@@ -106,24 +107,40 @@ def choose_again(package: MapPackage, folder: Path, budget_mb_per_km: float, *, 
     )
 
 
-def only_landmarks(visual_map: VisualMap, kept: Ids) -> VisualMap:
-    """The map with these landmarks only, numbered by the first and the last keyframe that saw them."""
-    observations = visual_map.observations
+def only_landmarks(visual_map: VisualMap, kept: Ids) -> LocalizationMap:
+    """These landmarks only, numbered by the first and the last keyframe that saw them.
+
+    A landmark that was overlooked by a few keyframes between others counts as seen by them as well.
+    """
     number = np.full(len(visual_map.landmarks), -1, np.int64)
     number[kept] = np.arange(len(kept))
-    rows = np.flatnonzero(number[observations.landmark_index] >= 0)
+    landmark = number[visual_map.observations.landmark_index]
+    is_kept = landmark >= 0
+    landmark, keyframe = _bridged(landmark[is_kept], visual_map.observations.keyframe_index[is_kept])
     first, last = np.full(len(kept), len(visual_map.keyframes)), np.full(len(kept), -1)
-    index = number[observations.landmark_index[rows]]
-    np.minimum.at(first, index, observations.keyframe_index[rows])
-    np.maximum.at(last, index, observations.keyframe_index[rows])
+    np.minimum.at(first, landmark, keyframe)
+    np.maximum.at(last, landmark, keyframe)
     order = np.lexsort((kept, last, first))
-    number[kept[order]] = np.arange(len(kept))
-    few = taken(observations, rows)
-    return replace(
-        visual_map,
-        landmarks=taken(visual_map.landmarks, kept[order]),
-        observations=replace(few, landmark_index=number[few.landmark_index].astype(np.int32)),
+    number[order] = np.arange(len(kept))
+    pairs = np.sort(keyframe << 32 | number[landmark])
+    return LocalizationMap(
+        visual_map.anchor,
+        visual_map.keyframes,
+        taken(visual_map.landmarks, kept[order]),
+        (pairs >> 32).astype(np.int32),
+        (pairs & 0xFFFFFFFF).astype(np.int32),
     )
+
+
+def _bridged(landmark: Ids, keyframe: NDArray[np.int32]) -> tuple[Ids, Ids]:
+    """Pairs (M,) and those that fill gaps of at most _GAP keyframes between a landmark's."""
+    pairs = np.unique(landmark << 32 | keyframe)
+    steps = np.diff(pairs, append=pairs[-1:])
+    missing = np.where((steps > 1) & (steps <= _GAP + 1), steps - 1, 0)  # steps between landmarks are larger
+    ends = np.cumsum(missing)
+    within = np.arange(missing.sum()) - np.repeat(ends - missing, missing) + 1
+    pairs = np.concatenate([pairs, np.repeat(pairs, missing) + within])
+    return pairs >> 32, pairs & 0xFFFFFFFF
 
 
 def _length_km(visual_map: VisualMap) -> float:

@@ -13,6 +13,8 @@ track resemble each other and weigh less for it: see fleetmap.track_correlation.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,6 +30,14 @@ _LEAST_FACTOR = 0.05
 _FREEDOMS_OF_USUAL = 4.0  # what the median of all tracks weighs against the track's own residuals
 _MIN_DEPTH_M = 1e-2
 _WEAKEST_M = 1e3  # what is known of a landmark without any observation
+
+
+def with_precision(visual_map: VisualMap) -> VisualMap:
+    """The same map with ``Landmarks.sigmas_m``."""
+    landmarks = visual_map.landmarks
+    if landmarks.sigmas_m is not None:
+        return visual_map
+    return replace(visual_map, landmarks=replace(landmarks, sigmas_m=landmark_sigmas_m(visual_map)))
 
 
 def landmark_sigmas_m(visual_map: VisualMap) -> NDArray[np.float32]:

@@ -121,7 +121,7 @@ def write_package(
     quality: Quality,
     provenance: Provenance,
     road_quality: RoadQuality | None = None,
-    localizable: VisualMap | None = None,
+    localizable: LocalizationMap | None = None,
     force: bool = False,
 ) -> Manifest:
     """Write a map as a package. The folder is there whole or not at all; the same map gives the same bytes.
@@ -136,9 +136,7 @@ def write_package(
     check_map_id(map_id)
     target = folder.resolve()
     check_target(target, force)
-    parts, manifest = encode_package(
-        visual_map, localizable or visual_map, map_id, quality, provenance, road_quality
-    )
+    parts, manifest = encode_package(visual_map, localizable, map_id, quality, provenance, road_quality)
     manifest_bytes = manifest.to_bytes()
     if len(manifest_bytes) > MAX_MANIFEST_BYTES:
         raise MapPackageError(f"manifest of map '{map_id}' exceeds {MAX_MANIFEST_BYTES} bytes; split the drive")

@@ -4,27 +4,27 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
 from fleetmap.cell import Cell, CellIndex
-from fleetmap.cells import encode_cell, split_into_cells
+from fleetmap.cells import encode_cell, split_into_cells, whole_map
 from fleetmap.errors import MapPackageError
 from fleetmap.footprint import bounding_box, keyframes_lonlat, thinned
 from fleetmap.full_part import check_visual_map, encode_full
 from fleetmap.geometry import Sim3, quat_xyzw_from_rotations
-from fleetmap.landmark_precision import landmark_sigmas_m
+from fleetmap.landmark_precision import with_precision
 from fleetmap.manifest import MAX_PART_BYTES, Localizable, Manifest, Provenance, Quality, make_manifest
 from fleetmap.quality_part import encode_quality
 from fleetmap.road_quality import RoadQuality
-from fleetmap.visual_map import VisualMap
+from fleetmap.visual_map import LocalizationMap, VisualMap
 
 
 def encode_package(
     visual_map: VisualMap,
-    localizable: VisualMap,
+    localizable: LocalizationMap | None,
     map_id: str,
     quality: Quality,
     provenance: Provenance,
@@ -36,8 +36,7 @@ def encode_package(
         MapPackageError: the map is empty or too large, or contradicts itself or its quality record.
     """
     origin = f"map '{map_id}'"
-    for content in (visual_map, localizable):
-        check_visual_map(content, origin)
+    check_visual_map(visual_map, origin)
     keyframes, landmarks = visual_map.keyframes, visual_map.landmarks
     if len(keyframes) == 0:
         raise MapPackageError(f"{origin} holds no keyframes")
@@ -46,7 +45,8 @@ def encode_package(
     check_counts(quality.observations, {"observations": len(visual_map.observations)}, origin)
     if road_quality is not None:
         check_counts(quality.keyframes, {"keyframes along the road": len(road_quality.keyframes)}, origin)
-    parts, records = _encode_parts(visual_map, _with_precision(localizable), road_quality)
+    localizable = localizable or whole_map(with_precision(visual_map))
+    parts, records = _encode_parts(visual_map, localizable, road_quality)
     lonlat = keyframes_lonlat(visual_map.anchor, keyframes)
     fields = {
         "map_id": map_id,
@@ -63,7 +63,7 @@ def encode_package(
     return parts, make_manifest(fields, origin)
 
 
-def cell_parts(localizable: VisualMap) -> dict[CellIndex, tuple[bytes, Cell]]:
+def cell_parts(localizable: LocalizationMap) -> dict[CellIndex, tuple[bytes, Cell]]:
     """The cells of a map or of what was chosen of it, encoded, in order of their index.
 
     Raises:
@@ -86,16 +86,8 @@ def check_counts(wanted: int, counted: dict[str, int], origin: str) -> None:
             raise MapPackageError(f"{origin} contradicts itself: {count} {what}, its quality record says {wanted}")
 
 
-def _with_precision(visual_map: VisualMap) -> VisualMap:
-    """The same with ``Landmarks.sigmas_m``."""
-    landmarks = visual_map.landmarks
-    if landmarks.sigmas_m is not None:
-        return visual_map
-    return replace(visual_map, landmarks=replace(landmarks, sigmas_m=landmark_sigmas_m(visual_map)))
-
-
 def _encode_parts(
-    visual_map: VisualMap, localizable: VisualMap, road_quality: RoadQuality | None
+    visual_map: VisualMap, localizable: LocalizationMap, road_quality: RoadQuality | None
 ) -> tuple[list[bytes], list[dict[str, Any]]]:
     """Cells in order, the full part, and the quality part where there is one; each with its record."""
     parts: list[bytes] = []
@@ -111,10 +103,10 @@ def _encode_parts(
     return parts, records
 
 
-def _localizable(localizable: VisualMap, records: Sequence[dict[str, Any]]) -> Localizable:
+def _localizable(localizable: LocalizationMap, records: Sequence[dict[str, Any]]) -> Localizable:
     return Localizable(
         keyframes=len(localizable.keyframes),
-        landmarks=len(np.unique(localizable.observations.landmark_index)),
+        landmarks=len(np.unique(localizable.seen_landmark)),
         size_bytes=sum(record["size_bytes"] for record in records if record["kind"] == "cell"),
     )
 

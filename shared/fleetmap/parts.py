@@ -5,7 +5,8 @@
     8       2     major version; another one is refused
     10      2     minor version; a newer one may bring arrays and fields that this reader passes over
     12      4     header length in bytes
-    16            header, JSON: kind, attributes, payload_bytes, arrays [{name, dtype, shape, offset, length}]
+    16            header, JSON: kind, attributes, payload_bytes, arrays [{name, dtype, shape, offset, length}];
+                  deflated since version 2
     ...           payload, one zlib stream; offsets and lengths count in the inflated payload
 
 Inside the payload every array lies as byte planes (all first bytes, all second bytes, ...), which deflate
@@ -30,7 +31,8 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints, Validation
 from fleetmap.errors import MapPackageError
 
 PART_MAGIC = b"FMPART\r\n"
-PART_MAJOR, PART_MINOR = 1, 0
+PART_MAJOR, PART_MINOR = 2, 0
+_OLDEST_MAJOR = 1  # whose header is not deflated
 MAX_HEADER_BYTES = 64 * 1024
 MAX_PAYLOAD_BYTES = 1024 * 1024 * 1024
 MAX_ARRAYS = 256
@@ -133,8 +135,9 @@ def encode_part(
         separators=(",", ":"),
         allow_nan=False,
     ).encode()
-    preamble = _PREAMBLE.pack(PART_MAGIC, PART_MAJOR, PART_MINOR, len(header))
-    return preamble + header + zlib.compress(b"".join(planes), _DEFLATE_LEVEL)
+    deflated = zlib.compress(header, _DEFLATE_LEVEL)
+    preamble = _PREAMBLE.pack(PART_MAGIC, PART_MAJOR, PART_MINOR, len(deflated))
+    return preamble + deflated + zlib.compress(b"".join(planes), _DEFLATE_LEVEL)
 
 
 def decode_part(data: bytes, origin: str, max_payload_bytes: int = MAX_PAYLOAD_BYTES) -> Part:
@@ -143,12 +146,15 @@ def decode_part(data: bytes, origin: str, max_payload_bytes: int = MAX_PAYLOAD_B
     Raises:
         MapPackageError: no part, truncated, damaged, larger than it may be, or of another major version.
     """
-    minor, header_length = _read_preamble(data, origin)
+    major, minor, header_length = _read_preamble(data, origin)
     payload_start = _PREAMBLE.size + header_length
     if payload_start > len(data):
         raise MapPackageError(f"{origin} is truncated inside its header")
+    text = data[_PREAMBLE.size : payload_start]
+    if major > 1:
+        text = _inflate_header(text, origin)
     try:
-        header = _Header.model_validate_json(data[_PREAMBLE.size : payload_start])
+        header = _Header.model_validate_json(text)
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(str(step) for step in first["loc"])
@@ -166,21 +172,22 @@ def decode_part(data: bytes, origin: str, max_payload_bytes: int = MAX_PAYLOAD_B
     return Part(header.kind, header.attributes, minor, origin, records, payload)
 
 
-def _read_preamble(data: bytes, origin: str) -> tuple[int, int]:
+def _read_preamble(data: bytes, origin: str) -> tuple[int, int, int]:
     if len(data) < _PREAMBLE.size:
         raise MapPackageError(f"{origin} is no map part: only {len(data)} bytes long")
     magic, major, minor, header_length = _PREAMBLE.unpack_from(data)
     if magic != PART_MAGIC:
         raise MapPackageError(f"{origin} is no map part: it begins with {magic!r}")
-    if major != PART_MAJOR:
+    if not _OLDEST_MAJOR <= major <= PART_MAJOR:
         raise MapPackageError(
-            f"{origin} has part format {major}, this fleetmap reads {PART_MAJOR}; upgrade fleetmap"
+            f"{origin} has part format {major}, this fleetmap reads {_OLDEST_MAJOR} to {PART_MAJOR}; "
+            "upgrade fleetmap"
         )
     if header_length > MAX_HEADER_BYTES:
         raise MapPackageError(
             f"{origin} declares a header of {header_length} bytes, at most {MAX_HEADER_BYTES} hold"
         )
-    return minor, header_length
+    return major, minor, header_length
 
 
 def _check_record(record: _ArrayRecord, payload_bytes: int, origin: str) -> None:
@@ -190,6 +197,17 @@ def _check_record(record: _ArrayRecord, payload_bytes: int, origin: str) -> None
     dtype = DTYPES.get(record.dtype)
     if dtype is not None and math.prod(record.shape) * dtype.itemsize != record.length:
         raise MapPackageError(f"{origin}: array '{record.name}' has a length that its shape does not explain")
+
+
+def _inflate_header(deflated: bytes, origin: str) -> bytes:
+    stream = zlib.decompressobj()
+    try:
+        text = stream.decompress(deflated, MAX_HEADER_BYTES)
+    except zlib.error as error:
+        raise MapPackageError(f"{origin} has a header that cannot be inflated: {error}") from error
+    if not stream.eof or stream.unused_data:
+        raise MapPackageError(f"{origin} has a header that is truncated or larger than {MAX_HEADER_BYTES} bytes")
+    return text
 
 
 def _inflate(deflated: memoryview, size: int, origin: str) -> bytes:

@@ -55,13 +55,15 @@ def assemble() -> Callable[..., bytes]:
 
 def explode_part(data: bytes) -> tuple[dict[str, Any], bytes]:
     """Header and inflated payload of a part, taken apart without the code under test."""
-    length = struct.unpack_from("<I", data, 12)[0]
-    return json.loads(data[16 : 16 + length]), zlib.decompress(data[16 + length :])
+    major, _, length = struct.unpack_from("<HHI", data, 8)
+    header = data[16 : 16 + length]
+    return json.loads(zlib.decompress(header) if major > 1 else header), zlib.decompress(data[16 + length :])
 
 
-def assemble_part(header: Any, payload: bytes, *, major: int = 1, minor: int = 0) -> bytes:
+def assemble_part(header: Any, payload: bytes, *, major: int = 2, minor: int = 0) -> bytes:
     """A part with whatever header and payload."""
     text = json.dumps(header).encode()
+    text = zlib.compress(text) if major > 1 else text
     return struct.pack("<8sHHI", b"FMPART\r\n", major, minor, len(text)) + text + zlib.compress(payload)
 
 

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleetmap.cells import Cell, decode_cell, encode_cell, merge_cells, split_into_cells
+from fleetmap.cells import Cell, decode_cell, encode_cell, merge_cells, split_into_cells, whole_map
 from fleetmap.errors import MapPackageError
 from fleetmap.full_part import decode_full, encode_full
 from fleetmap.geodesy import UtmAnchor
@@ -48,7 +48,7 @@ def through_bytes(visual_map: VisualMap) -> dict[tuple[int, int], Cell]:
         index: decode_cell(
             encode_cell(index, cell, visual_map.anchor), record_of(index, cell), visual_map.anchor, "here"
         )
-        for index, cell in split_into_cells(visual_map).items()
+        for index, cell in split_into_cells(whole_map(visual_map)).items()
     }
 
 
@@ -196,9 +196,10 @@ def test_precision_comes_back_a_little_too_pessimistic_and_never_too_optimistic(
     observed = np.unique(visual_map.observations.landmark_index)
     assert merged.landmarks.sigmas_m is not None
     assert visual_map.landmarks.sigmas_m is not None
-    ratios = merged.landmarks.sigmas_m / visual_map.landmarks.sigmas_m[observed]
+    rounding_m = 0.008 / np.sqrt(12.0)
+    ratios = merged.landmarks.sigmas_m / np.hypot(visual_map.landmarks.sigmas_m[observed], rounding_m)
     assert ratios.min() > 0.9999
-    assert 1.05 < ratios.max() < 1.063
+    assert 1.07 < ratios.max() < 1.084
     covariances = merged.keyframes.covariances
     assert covariances is not None
     np.testing.assert_array_equal(np.isnan(covariances[:, 0, 0]), np.arange(len(covariances)) % 2 == 1)
@@ -213,7 +214,7 @@ def test_landmarks_are_rounded_no_more_than_they_are_uncertain_and_alike_in_ever
     across_m = visual_map.landmarks.sigmas_m[observed, 0]
     rounded_m = np.abs(merged.landmarks.points_m - visual_map.landmarks.points_m[observed]).max(axis=1)
     assert 0.05 < rounded_m.max() < 0.52  # of half a step of 1,024 mm
-    assert (rounded_m <= across_m / 8.0 * 1.07 + 0.00051).all()
+    assert (rounded_m <= np.maximum(across_m / 8.0 * 1.09, 0.004) + 0.00051).all()
     shared = 0
     for one, other in pairwise(cells):
         _, mine, theirs = np.intersect1d(one.landmark_ids, other.landmark_ids, return_indices=True)
@@ -234,7 +235,7 @@ def test_landmarks_come_and_go_as_often_as_they_like(make_map: MakeMap) -> None:
 
 def test_a_cell_of_an_unknown_layout_asks_for_an_upgrade(make_map: MakeMap, explode: Explode) -> None:
     visual_map = make_map()
-    (index, cell), *_ = split_into_cells(visual_map).items()
+    (index, cell), *_ = split_into_cells(whole_map(visual_map)).items()
     header, _ = explode(encode_cell(index, cell, visual_map.anchor))
     later = encode_part("cell", header["attributes"] | {"layout": 3}, {})
     with pytest.raises(MapPackageError, match="cell layout that this fleetmap does not know; upgrade fleetmap"):
@@ -250,7 +251,7 @@ def test_two_cells_that_claim_one_keyframe_are_refused(make_map: MakeMap) -> Non
 
 def test_a_cell_of_another_place_zone_or_size_is_refused(make_map: MakeMap) -> None:
     visual_map = make_map()
-    (index, cell), *_ = split_into_cells(visual_map).items()
+    (index, cell), *_ = split_into_cells(whole_map(visual_map)).items()
     data, record = encode_cell(index, cell, visual_map.anchor), record_of(index, cell)
     decode_cell(data, record, visual_map.anchor, "here")
     with pytest.raises(MapPackageError, match="here is not the cell"):
@@ -296,14 +297,14 @@ def put(name: str, place: Any, value: object) -> Callable[[Arrays], None]:
         (lambda arrays: arrays.pop("landmark_looks"), "lacks the array 'landmark_looks'"),
         (lambda arrays: arrays.update(landmark_runs=arrays["landmark_runs"][:-1]), "'landmark_runs'"),
         (lambda arrays: arrays.update(runs=arrays["runs"][:, :-1]), "runs, there are"),
-        (put("keyframe_covariances", (slice(6, 21), 0), [127] * 5 + [129] * 10), "the covariance of a keyframe is none"),
+        (put("keyframe_covariances", (slice(6, 21), 0), [127] * 5 + [129] * 10), "the covariance of a keyframe"),
     ],
 )
 def test_a_cell_that_contradicts_itself_is_refused(
     make_map: MakeMap, explode: Explode, change: Callable[[Arrays], None], complaint: str
 ) -> None:
     visual_map = with_precision(make_map())
-    (index, cell), *_ = split_into_cells(visual_map).items()
+    (index, cell), *_ = split_into_cells(whole_map(visual_map)).items()
     header, payload = explode(encode_cell(index, cell, visual_map.anchor))
     arrays = {item["name"]: values(item, payload) for item in header["arrays"]}
     change(arrays)
@@ -352,7 +353,7 @@ def test_a_damaged_but_well_deflated_part_is_refused_or_still_a_sound_map(
     is_full: bool,
 ) -> None:
     visual_map, manifest = small
-    (index, cell), *_ = split_into_cells(visual_map).items()
+    (index, cell), *_ = split_into_cells(whole_map(visual_map)).items()
     header, payload = explode(encode_full(visual_map) if is_full else encode_cell(index, cell, visual_map.anchor))
     damaged = bytearray(payload)
     for place, value in bytes_changed:

@@ -90,8 +90,30 @@ def test_a_copy_made_in_text_mode_is_refused() -> None:
 
 def test_a_newer_major_version_asks_for_an_upgrade(explode: Explode, assemble: Assemble) -> None:
     header, payload = explode(one_array())
-    with pytest.raises(MapPackageError, match="part format 2, this fleetmap reads 1; upgrade fleetmap"):
-        decode_part(assemble(header, payload, major=2), "here")
+    with pytest.raises(MapPackageError, match="part format 3, this fleetmap reads 1 to 2; upgrade fleetmap"):
+        decode_part(assemble(header, payload, major=3), "here")
+
+
+def test_a_part_of_version_1_reads_like_any_other(explode: Explode, assemble: Assemble) -> None:
+    header, payload = explode(one_array())
+    part = decode_part(assemble(header, payload, major=1), "here")
+    np.testing.assert_array_equal(part.array("points", "<f8", (4, 3)), np.arange(12.0).reshape(4, 3))
+
+
+@pytest.mark.parametrize(
+    ("header", "complaint"),
+    [
+        (zlib.compress(b" " * (parts.MAX_HEADER_BYTES + 1)), "truncated or larger than 65536"),
+        (zlib.compress(b"{}")[:-1], "truncated or larger than 65536"),
+        (zlib.compress(b"{}") + b"!", "truncated or larger than 65536"),
+        (b"{}", "cannot be inflated"),
+        (zlib.compress(b"{}"), "does not hold at 'kind'"),
+    ],
+)
+def test_a_header_that_does_not_inflate_to_what_it_should_is_refused(header: bytes, complaint: str) -> None:
+    data = struct.pack("<8sHHI", parts.PART_MAGIC, 2, 0, len(header)) + header + zlib.compress(b"")
+    with pytest.raises(MapPackageError, match=complaint):
+        decode_part(data, "here")
 
 
 def test_a_newer_minor_version_may_bring_unknown_fields_arrays_and_types(
@@ -233,7 +255,8 @@ def test_a_payload_beyond_the_limit_is_neither_written_nor_read() -> None:
 @settings(max_examples=300, deadline=None)
 @given(st.binary(max_size=300))
 def test_random_bytes_never_raise_anything_else(data: bytes) -> None:
-    for start in (b"", parts.PART_MAGIC, struct.pack("<8sHH", parts.PART_MAGIC, 1, 0)):
+    versions = [struct.pack("<8sHH", parts.PART_MAGIC, major, 0) for major in (1, 2)]
+    for start in (b"", parts.PART_MAGIC, *versions):
         with pytest.raises(MapPackageError):
             decode_part(start + data, "here")
 
