@@ -97,10 +97,10 @@ def test_a_recording_keeps_its_fixes_and_its_reference_becomes_the_new_camera_s(
 
 
 def test_a_moved_image_centre_turns_a_camera_s_axes() -> None:
-    recorded = Camera(1392, 512, 984.0, 984.0, 690.0, 233.0)
-    moved = replace(recorded, cx_px=710.0)
-    turn_deg = np.degrees(so3_log(map_from_recorded(recorded, moved)))
-    assert turn_deg == pytest.approx([0.0, -np.degrees(20.0 / 984.0), 0.0], abs=0.1)
+    """Of a long lens, whose rays hardly spread; a wide one's are turned less at its borders."""
+    recorded = Camera(1392, 512, 4000.0, 4000.0, 690.0, 233.0)
+    turn_deg = np.degrees(so3_log(map_from_recorded(recorded, replace(recorded, cx_px=770.0))))
+    assert turn_deg == pytest.approx([0.0, -np.degrees(80.0 / 4000.0), 0.0], abs=0.02)
     assert map_from_recorded(recorded, recorded) == pytest.approx(np.eye(3), abs=1e-12)
 
 
@@ -108,7 +108,7 @@ def test_a_pair_is_told_to_evaluate_in_the_axes_of_the_map() -> None:
     recorded = Camera(1392, 512, 984.0, 984.0, 690.0, 233.0)
     mounting = Pose(so3_exp(np.array([0.01, -0.02, 0.03])), np.array([0.54, 0.0, 0.0]))
     pair = CameraPair.of(mounting, recorded, replace(recorded, cx_px=710.0))
-    assert pair.axes_turned_deg == pytest.approx(1.16, abs=0.1)
+    assert 0.9 < pair.axes_turned_deg < 1.16
     _, offset, _, rotation = pair.options.split()
     turn = map_from_recorded(recorded, replace(recorded, cx_px=710.0))
     assert [float(word) for word in offset.split(",")] == pytest.approx(turn @ [0.54, 0.0, 0.0], abs=1e-4)
