@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import socket
+from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,9 +21,14 @@ from fleetmap.simulation.look import Look
 from fleetmap.simulation.rendering import render, true_points
 from fleetmap.simulation.street import Street, build_street
 from fleetmap.trajectory import Trajectory
+from fleetmap.transport import MapClient
 from fleetmap.vision.features import FeatureExtractor, Features
 from fleetmap.vision.matching import match_by_projection
 from fleetmap.visual_map import Keyframes, Landmarks, LocalizationMap, Observations, VisualMap
+from fleetmap_localizer import map_fetching
+from fleetmap_localizer.map_source import MapServer
+from fleetmap_server.server import running_server
+from fleetmap_server.settings import ServerSettings
 
 SURVEY_CAMERA = Camera(640, 400, 430.0, 430.0, 319.5, 199.5)
 SECOND_CAMERA = Camera(720, 420, 560.0, 558.0, 352.0, 214.0, (-0.25, 0.08, 1e-3, -5e-4, 0.0))
@@ -176,3 +184,41 @@ def _provenance(survey: Trajectory) -> Provenance:
         end_ns=int(survey.stamps_ns[-1]),
         created_ns=int(survey.stamps_ns[-1]),
     )
+
+
+class Site:
+    """A map server that can leave and come back."""
+
+    def __init__(self, folder: Path) -> None:
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            self.endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+        self.store = folder / "store"
+        self._running = ExitStack()
+        self.start()
+
+    def start(self) -> None:
+        """Begin, or come back."""
+        settings = ServerSettings(self.store, self.endpoint, http_port=0, drain_s=0.0)
+        self._running.enter_context(running_server(settings))
+
+    def leave(self) -> None:
+        self._running.close()
+
+    def publish(self, folder: Path) -> str:
+        """Publish a package; its version."""
+        package = open_package(folder)
+        with MapClient(self.endpoint) as client:
+            return client.publish(package.manifest_bytes, package.part_bytes).version
+
+    def origin(self, map_id: str | None = None) -> MapServer:
+        return MapServer(self.endpoint, lambda **how: MapClient(self.endpoint, **how), map_id, patience_s=0.1)
+
+
+@pytest.fixture
+def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
+    monkeypatch.setattr(map_fetching, "_FIRST_PAUSE_S", 0.05)
+    monkeypatch.setattr(map_fetching, "_LONGEST_PAUSE_S", 0.05)
+    site = Site(tmp_path)
+    yield site
+    site.leave()

@@ -5,9 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-import socket
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, closing
+from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -21,14 +20,11 @@ from fleetmap.manifest import Provenance, Quality
 from fleetmap.map_package import open_package, write_package
 from fleetmap.transport import MapClient
 from fleetmap.visual_map import Keyframes, Landmarks, Observations, VisualMap
-from fleetmap_localizer import map_fetching
-from fleetmap_localizer.map_source import MapServer, read_map
+from fleetmap_localizer.map_source import read_map
 from fleetmap_localizer.map_view import MapView
 from fleetmap_localizer.map_window import WindowSettings
 from fleetmap_localizer.pose_estimate import NoPose, PoseEstimate
 from fleetmap_localizer.tile_supply import TileSupply, map_supply_of
-from fleetmap_server.server import running_server
-from fleetmap_server.settings import ServerSettings
 
 CAMERA = Camera(640, 400, 430.0, 430.0, 319.5, 199.5)
 ANCHOR = UtmAnchor(32632, 691_200, 5_334_784, 500)  # the south-west corner of a cell
@@ -82,11 +78,6 @@ def write_road(
     return folder
 
 
-def publish(client: MapClient, folder: Path) -> str:
-    package = open_package(folder)
-    return client.publish(package.manifest_bytes, package.part_bytes).version
-
-
 def pose_at(east_m: float, at_s: float) -> PoseEstimate:
     place = Pose(np.eye(3), ANCHOR.utm_from_map(np.array([east_m, 60.0, 0.0])))
     return PoseEstimate(round(at_s * 1e9), ANCHOR.epsg, place, np.eye(6) * 1e-6, "road", "0" * 64, 50)
@@ -122,41 +113,6 @@ def wait_for(supply: TileSupply, wanted: Callable[[tuple[MapView, ...]], bool]) 
         is_there = supply._changed.wait_for(lambda: wanted(supply._views or ()), PATIENCE_S)
     assert is_there, "no such views in time"
     return supply.views()
-
-
-class Site:
-    """A map server that can leave and come back."""
-
-    def __init__(self, folder: Path) -> None:
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            self.endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-        self.store = folder / "store"
-        self._running = ExitStack()
-        self.start()
-
-    def start(self) -> None:
-        settings = ServerSettings(self.store, self.endpoint, http_port=0, drain_s=0.0)
-        self._running.enter_context(running_server(settings))
-
-    def leave(self) -> None:
-        self._running.close()
-
-    def publish(self, folder: Path) -> str:
-        with MapClient(self.endpoint) as client:
-            return publish(client, folder)
-
-    def origin(self, map_id: str | None = None) -> MapServer:
-        return MapServer(self.endpoint, lambda **how: MapClient(self.endpoint, **how), map_id, patience_s=0.1)
-
-
-@pytest.fixture
-def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
-    monkeypatch.setattr(map_fetching, "_FIRST_PAUSE_S", 0.05)
-    monkeypatch.setattr(map_fetching, "_LONGEST_PAUSE_S", 0.05)
-    site = Site(tmp_path)
-    yield site
-    site.leave()
 
 
 @pytest.fixture(scope="module")
@@ -206,7 +162,7 @@ def test_the_views_of_a_vehicle_that_has_not_moved_stay_the_same_objects(road: P
         assert drive(supply, 540.0, 560.0) is views
 
 
-def test_only_cells_around_are_fetched_and_only_once(site: Site, road: Path, tmp_path: Path) -> None:
+def test_only_cells_around_are_fetched_and_only_once(site, road: Path, tmp_path: Path) -> None:
     site.publish(road)
     cache = tmp_path / "cache"
     records = {record.sha256: record for record in open_package(road).manifest.parts if record.cell is not None}
@@ -235,7 +191,7 @@ def wait_until_nothing_is_wished(supply: TileSupply) -> None:
         assert fetcher._changed.wait_for(lambda: not fetcher._wishes, PATIENCE_S)
 
 
-def test_a_drive_on_a_server_is_the_same_as_on_a_folder(site: Site, road: Path, tmp_path: Path) -> None:
+def test_a_drive_on_a_server_is_the_same_as_on_a_folder(site, road: Path, tmp_path: Path) -> None:
     site.publish(road)
     near = lat_lon(10.0)
     shown = []
@@ -249,7 +205,7 @@ def test_a_drive_on_a_server_is_the_same_as_on_a_folder(site: Site, road: Path, 
 
 
 def test_a_server_that_leaves_in_mid_drive_is_done_without_and_taken_up_again(
-    site: Site, road: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    site, road: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     site.publish(road)
     near, cache = lat_lon(10.0), tmp_path / "cache"
@@ -269,7 +225,7 @@ def test_a_server_that_leaves_in_mid_drive_is_done_without_and_taken_up_again(
 
 
 def test_a_vehicle_starts_without_its_server_from_what_an_earlier_day_left(
-    site: Site, road: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    site, road: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     site.publish(road)
     near, cache = lat_lon(10.0), tmp_path / "cache"
@@ -285,7 +241,7 @@ def test_a_vehicle_starts_without_its_server_from_what_an_earlier_day_left(
         stranger.views()
 
 
-def test_a_new_version_is_taken_up_in_mid_drive_without_a_gap(site: Site, road: Path, tmp_path: Path) -> None:
+def test_a_new_version_is_taken_up_in_mid_drive_without_a_gap(site, road: Path, tmp_path: Path) -> None:
     old = site.publish(road)
     newer = write_road(tmp_path / "newer", day=1, seed=2)
     near, cache = lat_lon(10.0), tmp_path / "cache"
@@ -300,7 +256,7 @@ def test_a_new_version_is_taken_up_in_mid_drive_without_a_gap(site: Site, road: 
 
 
 def test_the_version_in_use_stays_where_the_next_cannot_be_read(
-    site: Site, road: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    site, road: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     old = site.publish(road)
     newer = spoil(write_road(tmp_path / "newer", day=1, seed=2), 1)
@@ -338,7 +294,7 @@ def test_a_folder_with_a_bad_tile_gives_the_others(
 
 @pytest.mark.parametrize("how", ["undecodable", "tampered with", "missing"])
 def test_a_server_with_a_bad_tile_gives_the_others(
-    site: Site, tmp_path: Path, caplog: pytest.LogCaptureFixture, how: str
+    site, tmp_path: Path, caplog: pytest.LogCaptureFixture, how: str
 ) -> None:
     folder = write_road(tmp_path / "road", last=4)
     if how == "undecodable":
@@ -357,7 +313,7 @@ def test_a_server_with_a_bad_tile_gives_the_others(
 
 
 def test_a_version_that_is_retired_in_mid_drive_is_used_as_far_as_it_has_come(
-    site: Site, road: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    site, road: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     site.publish(road)
     near, cache = lat_lon(10.0), tmp_path / "cache"
@@ -373,7 +329,7 @@ def test_a_version_that_is_retired_in_mid_drive_is_used_as_far_as_it_has_come(
 
 
 def test_where_maps_overlap_the_newest_is_looked_into_alone_and_the_next_where_it_ends(
-    site: Site, tmp_path: Path
+    site, tmp_path: Path
 ) -> None:
     for number, (map_id, first, last) in enumerate([("old", 0, 6), ("west", 0, 4), ("east", 5, 11)]):
         site.publish(write_road(tmp_path / map_id, map_id, first=first, last=last, day=number, seed=number))
@@ -386,7 +342,7 @@ def test_where_maps_overlap_the_newest_is_looked_into_alone_and_the_next_where_i
 
 
 def test_more_maps_than_can_be_searched_are_the_newest_and_one_warning(
-    site: Site, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    site, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     for number in range(3):
         first = 20 * number
@@ -400,7 +356,7 @@ def test_more_maps_than_can_be_searched_are_the_newest_and_one_warning(
     assert caplog.text.count("say --near where the vehicle is") == 1
 
 
-def test_nothing_to_look_into_is_one_clear_error(site: Site, road: Path, tmp_path: Path) -> None:
+def test_nothing_to_look_into_is_one_clear_error(site, road: Path, tmp_path: Path) -> None:
     def first_views(**settings: object) -> None:
         origin = site.origin(settings.pop("map_id", None))  # type: ignore[arg-type]
         with closing(map_supply_of(origin, CAMERA, cache=tmp_path / "cache", **settings)) as supply:  # type: ignore[arg-type]
