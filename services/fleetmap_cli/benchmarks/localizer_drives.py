@@ -90,13 +90,13 @@ def query_rows(simulated: SimulatedDrives) -> tuple[Row, ...]:
 def _plain(bench: Workbench) -> Figures:
     queries = _camera_1(bench)
     figures = _against_camera_0(bench, queries, Pose.identity())
-    peers = {
+    peers: dict[str, Figures] = {
         "stella_vslam": {"success": "399 of 399", "median m": 0.03, "ms an image": 42},
         "ORB-SLAM3, tracking": {"median m": 0.016, "ms an image": 28.5},
         "COLMAP": {"success": "50 of 50", "ms an image": 1900},
     }
     for name, peer in peers.items():
-        bench.beside(name, {**peer})
+        bench.beside(name, peer)
     return figures
 
 

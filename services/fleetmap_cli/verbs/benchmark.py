@@ -60,7 +60,9 @@ def benchmark(
       mapper      maps of the real drives and of a simulated circuit: plain SLAM beside its peers, each
                   kind of GNSS beside splines through the same fixes, bad fixes, what each use of the
                   fixes gives, images a second; about an hour in all
-      localizer   a second camera in the map of the first
+      localizer   a second vehicle in the first one's map: another camera, dark, turned away, at half the
+                  resolution, in the other lane at dusk; maps with and without GNSS; each row counts poses
+                  that are wrong and do not say so
       server      maps published and fetched beside raw TCP, by a fleet, over slow and broken links, through
                   restarts; 100,000 maps in a catalogue; a map of a million landmarks
 
