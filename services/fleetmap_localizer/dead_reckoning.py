@@ -166,7 +166,8 @@ class DeadReckoning:
                     stream.skip_until(stamp_ns)
 
     def _next_event_ns(self, stamp_ns: int) -> int | None:
-        """When the next wheel speed or fix comes; None if not before a stamp."""
+        """When the next wheel speed or fix comes that counts; None if not before a stamp."""
+        self._wheels.skip_until(self._wheels_ns + round(self._settings.wheel.least_interval_s * 1e9) - 1)
         coming = [stream.next.stamp_ns for stream in (self._wheels, self._fixes) if stream.next is not None]
         return min((event_ns for event_ns in coming if event_ns <= stamp_ns), default=None)
 

@@ -13,14 +13,14 @@ _DEG = float(np.radians(1.0))
 class ImuSettings:
     """How an inertial measurement unit errs: at least as much as the MEMS units that vehicles carry.
 
-    Densities are twice the data sheets' (Bosch BMI160, Analog Devices ADIS16448), for what vibration adds.
+    Densities are three times the data sheets' (Bosch BMI160, Analog Devices ADIS16448), for what vibration adds.
     """
 
-    gyro_noise_rad_s_rthz: float = 3.0e-4
+    gyro_noise_rad_s_rthz: float = 5.0e-4
     gyro_bias_walk_rad_s2_rthz: float = 3.0e-5
     gyro_bias_sigma_rad_s: float = 2.0 * _DEG  # constant after switching on
     gyro_mixing_sigma: float = 0.015  # scale errors, and how much of one axis another axis sees
-    accel_noise_m_s2_rthz: float = 4.0e-3
+    accel_noise_m_s2_rthz: float = 6.0e-3
     accel_bias_walk_m_s3_rthz: float = 3.0e-3
     accel_bias_sigma_m_s2: float = 0.3  # 30 mg; with what a tilted mounting adds
     longest_pause_s: float = 0.1  # between samples; nothing is known of the motion across a longer one
@@ -34,6 +34,7 @@ class WheelSettings:
     scale_walk_rts: float = 5.0e-4  # per root of a second: warming up, load
     speed_sigma_mps: float = 0.05  # steps of the bus, teeth
     speed_correlation_s: float = 0.1
+    least_interval_s: float = 0.04  # of more speeds than that, some are left out: their errors are alike anyway
     # Across the wheels: what springs and ruts do, a constant and a share of the speed. Neighbouring errors are
     # alike for the given time, so that fifty of them a second do not count as fifty.
     side_sigma_mps: float = 0.03

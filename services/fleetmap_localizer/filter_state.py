@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.geometry import Pose
 from fleetmap_localizer.filter_process import rotation_of
 
 Array = NDArray[np.float64]
@@ -40,11 +39,6 @@ class FilterState:
     axle_m: float  # how far ahead of the vehicle's frame the point is that does not slide aside in bends
     gnss_bias_m: Array  # (3,) along the grid's axes, in metres on the ground
     covariance: Array  # (SIZE, SIZE) of the error state
-
-    @property
-    def utm_from_base(self) -> Pose:
-        """The base's pose."""
-        return Pose(self.rotation, self.position_m)
 
     def carried(self, position_m: Array, velocity_m_s: Array, rotation: Array, covariance: Array) -> FilterState:
         """The state after a motion."""
