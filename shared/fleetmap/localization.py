@@ -23,7 +23,7 @@ class LocalizeRequest(_Model):
     """By which camera the image was taken, and what is known already."""
 
     camera: CameraText  # the content of a calibration file, see fleetmap.camera_file
-    lat_deg: LatDeg | None = None  # only maps that pass within 1 km of here are looked into
+    lat_deg: LatDeg | None = None  # off by 300 m at most: only what was mapped around here is looked into
     lon_deg: LonDeg | None = None
     stamp_ns: Int64 | None = None  # comes back in the answer
 

@@ -39,8 +39,8 @@ def localize_router(localizers: LocalizerPool) -> APIRouter:
         """Where an image was taken: a GeoPose, or null and the reason why there is none for sure.
 
         The pose is OGC GeoPose 1.0 (Basic-Quaternion) with more beside it. Position: WGS 84, height above the
-        ellipsoid. Quaternion: from the camera's axes (x where it looks, y to its left, z up) to true east, north and
-        up; the identity is a level camera that looks east.
+        ellipsoid. Quaternion: from the camera's axes (x where it looks, y to its left, z up) to true east, north
+        and up; the identity is a level camera that looks east.
         """
         if request.headers.get("content-type", "").partition(";")[0].strip().lower() != _FORM:
             raise HTTPException(415, f"send image and camera as {_FORM}, as 'curl -F' does")
@@ -97,7 +97,8 @@ _BODY: dict[str, Any] = {
                         },
                         "near": {
                             "type": "string",
-                            "description": "LAT,LON in degrees: only maps that pass within 1 km are looked into",
+                            "description": "LAT,LON in degrees, off by 300 m at most: only what was mapped around "
+                            "there is looked into",
                         },
                         "stamp_ns": {
                             "type": "integer",

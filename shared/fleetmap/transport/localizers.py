@@ -15,7 +15,7 @@ from fleetmap.transport.connecting import connect
 from fleetmap.transport.endpoints import check_endpoint
 from fleetmap.transport.session import Connection, NoAnswerError, ProblemError
 
-ANSWER_S = 30.0  # that a localizer may take for an image, fetching maps included
+ANSWER_S = 20.0  # that a localizer may take for an image, fetching maps included; a client of ours waits longer
 _GREETING_S, _REFUSED_S = 1.8, 0.2
 _AVOIDED_S = 2.0  # one that was away is asked last for so long
 _STATUS_BUSY = 503
