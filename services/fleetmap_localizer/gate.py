@@ -3,6 +3,12 @@
 Houses, cars and windows repeat. A copy of one of them at the wrong place can gather a hundred consistent matches;
 but it gathers them in one part of the image, while elsewhere the map's landmarks are not where the pose says.
 So it counts how much of the view agrees, beside how many landmarks do.
+
+How many must agree depends on how many could: where a map promises 2,500 landmarks, 30 of them find something
+alike near a wrong pose; where it promises 100, not 15 of them do. So the count is held against what chance would
+bring, and the same settings hold for dense maps and for sparse ones. Source, of judging a contrario: L. Moisan,
+B. Stival, "A probabilistic criterion to detect rigid point matches between two images and estimate the fundamental
+matrix", IJCV 57(3), 2004.
 """
 
 from __future__ import annotations
@@ -46,12 +52,26 @@ def is_trustworthy(fit: Fit, camera: Camera, settings: GateSettings) -> bool:
     return bool(
         answer.inlier_count >= settings.min_inliers
         and answer.inlier_count >= settings.min_inlier_ratio * len(fit.matched_px)
-        and answer.inlier_count >= settings.min_seen_ratio * len(fit.predicted_px)
+        and chance_of(answer.inlier_count, len(fit.predicted_px), settings.chance_ratio) <= settings.max_chance
         and np.count_nonzero(agreeing) >= settings.min_occupied_cells
         and _coverage(fit, agreeing, camera) >= settings.min_coverage
         and position_sigma_m <= settings.max_position_sigma_m
         and rotation_sigma_deg <= settings.max_rotation_sigma_deg
     )
+
+
+def chance_of(agreeing: int, predicted: int, ratio: float) -> float:
+    """At most how probable it is that so many of the predicted landmarks agree by chance, each with ``ratio``.
+
+    Source: W. Hoeffding, "Probability inequalities for sums of bounded random variables", 1963, eq. 2.1.
+    """
+    share = min(agreeing / max(predicted, 1), 1.0)
+    if share <= ratio:
+        return 1.0
+    surprise = share * np.log(share / ratio)
+    if share < 1.0:
+        surprise += (1.0 - share) * np.log((1.0 - share) / (1.0 - ratio))
+    return float(np.exp(-predicted * surprise))
 
 
 def _coverage(fit: Fit, agreeing: NDArray[np.int64], camera: Camera) -> float:

@@ -21,11 +21,12 @@ class LocalMapSettings:
 class GateSettings:
     """What a pose must show before it is believed: no pose is better than a wrong one."""
 
-    min_inliers: int
-    min_seen_ratio: float  # inliers per landmark that should be in view; does not depend on the map's density
+    chance_ratio: float  # of the landmarks that should be in view: how many may agree with a wrong pose
+    max_chance: float  # that so many agree with a wrong pose, see fleetmap_localizer.gate.chance_of
     min_coverage: float  # share of the view's cells, where landmarks are expected, in which some agree
     max_position_sigma_m: float
     max_rotation_sigma_deg: float = 1.0
+    min_inliers: int = 12  # for geometry's sake: six degrees of freedom, and how much they leave over
     min_inlier_ratio: float = 0.5  # inliers per matched landmark
     min_occupied_cells: int = 6  # of a grid of 8 x 4 over the image
 
@@ -56,7 +57,7 @@ class RelocalizationSettings:
     radii_px: tuple[float, ...] = (12.0, 5.0)  # windows around the projections, round after round
     max_rival: float = 0.8  # another place with this share of the best's inliers makes the answer ambiguous
     gate: GateSettings = GateSettings(
-        min_inliers=20, min_seen_ratio=0.03, min_coverage=0.55, max_position_sigma_m=0.2
+        chance_ratio=0.015, max_chance=1e-6, min_coverage=0.55, max_position_sigma_m=0.2
     )
 
 
@@ -74,7 +75,7 @@ class TrackingSettings:
     overruling_support: float = 2.0  # times the inliers before; a pose with more is believed against the motion
     # Looser: a prediction from images before vouches for the place, and traffic may hide half the view.
     gate: GateSettings = GateSettings(
-        min_inliers=15, min_seen_ratio=0.015, min_coverage=0.3, max_position_sigma_m=0.3
+        chance_ratio=0.0075, max_chance=1e-3, min_coverage=0.3, max_position_sigma_m=0.3
     )
 
 

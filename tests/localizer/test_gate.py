@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from fleetmap.camera import Camera
 from fleetmap.geometry import Pose
 from fleetmap.vision.absolute_pose import AbsolutePose
-from fleetmap_localizer.gate import Fit, is_trustworthy
+from fleetmap_localizer.gate import Fit, chance_of, is_trustworthy
 from fleetmap_localizer.settings import GateSettings
 
 CAMERA = Camera(800, 400, 500.0, 500.0, 399.5, 199.5)
-SETTINGS = GateSettings(min_inliers=20, min_seen_ratio=0.025, min_coverage=0.5, max_position_sigma_m=0.2)
+SETTINGS = GateSettings(chance_ratio=0.015, max_chance=1e-6, min_coverage=0.5, max_position_sigma_m=0.2)
 EVERYWHERE = np.stack(np.meshgrid(np.arange(5, 800, 20.0), np.arange(5, 400, 20.0)), axis=-1).reshape(-1, 2)
 
 
@@ -40,16 +41,36 @@ def test_landmarks_that_agree_all_over_the_view_are_trusted() -> None:
 
 
 def test_too_few_inliers_or_too_many_outliers_are_not() -> None:
-    assert len(EVERYWHERE[::44]) < 20 <= len(EVERYWHERE[::38])
-    assert not trusted(fit(EVERYWHERE[::44]))
+    assert not trusted(fit(EVERYWHERE[::30]))
+    assert trusted(fit(EVERYWHERE[::19]))
     assert trusted(fit(EVERYWHERE[::10], outliers=70))
     assert not trusted(fit(EVERYWHERE[::10], outliers=90))
 
 
 def test_few_of_many_expected_landmarks_are_not_trusted() -> None:
     expected = np.repeat(EVERYWHERE, 4, axis=0)
-    assert trusted(fit(EVERYWHERE[::10], predicted_px=expected))
-    assert not trusted(fit(EVERYWHERE[::11], predicted_px=expected))
+    assert trusted(fit(EVERYWHERE[::8], predicted_px=expected))
+    assert not trusted(fit(EVERYWHERE[::10], predicted_px=expected))
+
+
+def test_a_sparse_map_asks_for_fewer_landmarks_but_never_for_fewer_than_geometry_needs() -> None:
+    sparse = EVERYWHERE[::8]
+    assert len(sparse) == 100
+    assert trusted(fit(sparse[::7], predicted_px=sparse))
+    assert not trusted(fit(EVERYWHERE[::53]))  # as many, of eight times as many
+    assert len(sparse[::10]) < SETTINGS.min_inliers
+    assert not trusted(fit(sparse[::10], predicted_px=sparse[::9]))
+
+
+def test_the_chance_of_agreement_bounds_that_of_random_landmarks() -> None:
+    rng = np.random.default_rng(0)
+    for predicted, ratio, agreeing in ((100, 0.05, 12), (1000, 0.02, 32), (50, 0.1, 11)):
+        drawn = rng.binomial(predicted, ratio, 200_000)
+        measured = np.mean(drawn >= agreeing)
+        assert 0.0 < measured <= chance_of(agreeing, predicted, ratio) < 20.0 * measured
+    assert chance_of(1, 100, 0.02) == 1.0
+    assert chance_of(100, 100, 0.02) == pytest.approx(0.02**100)
+    assert chance_of(0, 0, 0.02) == 1.0
 
 
 def test_a_copy_of_one_house_is_not_trusted_however_many_points_it_has() -> None:
