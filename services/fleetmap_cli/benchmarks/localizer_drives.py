@@ -88,7 +88,7 @@ def query_rows(simulated: SimulatedDrives) -> tuple[Row, ...]:
 
 
 def _plain(bench: Workbench) -> Figures:
-    queries = _camera_1(bench)
+    queries = camera_1(bench)
     figures = _against_camera_0(bench, queries, Pose.identity())
     peers: dict[str, Figures] = {
         "stella_vslam": {"success": "399 of 399", "median m": 0.03, "ms an image": 42},
@@ -104,7 +104,7 @@ def _perturbed(name: str, about: str, options: str, yaw_deg: float) -> Row:
     peers = {"camera-1-dark": "191 of 200", "camera-1-yaw-15-dark": "196 of 200"}
 
     def measure(bench: Workbench) -> Figures:
-        _camera_1(bench)
+        camera_1(bench)
         bench.python_module("fleetmap_cli.benchmarks.perturbing", f"second.mcap {name}.mcap {options}")
         turn = Pose(cam_from_turned(yaw_deg), np.zeros(3))
         figures = _against_camera_0(bench, Queries(name, "survey"), turn)
@@ -115,7 +115,7 @@ def _perturbed(name: str, about: str, options: str, yaw_deg: float) -> Row:
     return Row(name, about, measure, (RAW,), QUERIES, ">= 98 %")
 
 
-def _camera_1(bench: Workbench) -> Queries:
+def camera_1(bench: Workbench) -> Queries:
     """Both cameras' recordings, and the map of camera 0."""
     bench.once(f"convert kitti-raw DATA/{RAW} survey.mcap --camera 0")
     bench.once(f"convert kitti-raw DATA/{RAW} second.mcap --camera 1 --no-gnss")
@@ -154,7 +154,7 @@ def _simulated(drives: SimulatedDrives) -> Callable[[Workbench], Figures]:
 
 
 def _placed_raw(bench: Workbench) -> Figures:
-    return _placed(bench, _camera_1(bench))
+    return _placed(bench, camera_1(bench))
 
 
 def _placed_simulated(drives: SimulatedDrives) -> Callable[[Workbench], Figures]:
