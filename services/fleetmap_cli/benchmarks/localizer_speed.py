@@ -14,8 +14,8 @@ SPEED = Group(
     "A localizer's time for an image",
     "Camera 1 of KITTI raw at its recorded size, 1392x512, in camera 0's map of 0.3 km: from the decoded image to "
     "the pose with its covariance, medians of all images. *ms*: one image after the other, by the wall clock; "
-    "*CPU*: processor time of all threads; then the parts of the wall clock's. *Images/s*: the whole drive, the next "
-    "image's features being found on the second core meanwhile.",
+    "*CPU*: processor time of all threads; then the parts of the wall clock's. *Images/s*: the whole drive, the "
+    "next image's features being found on the second core meanwhile.",
     (
         "ms",
         "p95 ms",
