@@ -154,11 +154,11 @@ class DeadReckoning:
         """Predict up to an image, taking in on the way what wheels and receiver say."""
         if stamp_ns < self._at_ns:
             raise InputError(f"an image at {stamp_ns} ns comes after one at {self._at_ns} ns; sort them by time")
-        while self._filter is not None and (event_ns := self._next_event_ns(stamp_ns)) is not None:
-            self._predict_to(self._filter, event_ns)
-            self._take_in(self._filter, event_ns)
-        if self._filter is not None:
-            self._predict_to(self._filter, stamp_ns)
+        while self._filter is not None and self._at_ns < stamp_ns:
+            event_ns = self._next_event_ns(stamp_ns)
+            self._predict_to(self._filter, stamp_ns if event_ns is None else event_ns)
+            if self._filter is not None and event_ns is not None:
+                self._take_in(self._filter, event_ns)
         self._at_ns = stamp_ns
         if self._filter is None:
             for stream in (self._wheels, self._fixes, self._imu):
