@@ -89,7 +89,7 @@ def query_rows(simulated: SimulatedDrives) -> tuple[Row, ...]:
 
 def _plain(bench: Workbench) -> Figures:
     queries = camera_1(bench)
-    figures = _against_camera_0(bench, queries, Pose.identity())
+    figures = against_camera_0(bench, queries, Pose.identity())
     peers: dict[str, Figures] = {
         "stella_vslam": {"success": "399 of 399", "median m": 0.03, "ms an image": 42},
         "ORB-SLAM3, tracking": {"median m": 0.016, "ms an image": 28.5},
@@ -107,7 +107,7 @@ def _perturbed(name: str, about: str, options: str, yaw_deg: float) -> Row:
         camera_1(bench)
         bench.python_module("fleetmap_cli.benchmarks.perturbing", f"second.mcap {name}.mcap {options}")
         turn = Pose(cam_from_turned(yaw_deg), np.zeros(3))
-        figures = _against_camera_0(bench, Queries(name, "survey"), turn)
+        figures = against_camera_0(bench, Queries(name, "survey"), turn)
         if name in peers:
             bench.beside("stella_vslam", {"success": peers[name]})
         return figures
@@ -123,7 +123,7 @@ def camera_1(bench: Workbench) -> Queries:
     return Queries("second", "survey")
 
 
-def _against_camera_0(bench: Workbench, queries: Queries, cam_1_from_query: Pose) -> Figures:
+def against_camera_0(bench: Workbench, queries: Queries, cam_1_from_query: Pose) -> Figures:
     """Relative to the survey's poses; how camera 1 is mounted is KITTI's own calibration of the raw images."""
     path = bench.data / RAW / "calib_cam_to_cam.txt"
     entries = read_calibration(path)

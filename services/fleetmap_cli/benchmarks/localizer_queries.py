@@ -27,12 +27,13 @@ _SAID_SO = 0.999  # unless the error lies inside this ellipsoid of the pose's ow
 
 @dataclass(frozen=True)
 class Queries:
-    """The images of NAME.mcap, localised in the map of SURVEY.mcap, which is SURVEY-map with SURVEY.tum."""
+    """The images of NAME.mcap, localised in a map of SURVEY.mcap, which is SURVEY-PACKAGE with SURVEY.tum."""
 
     name: str
     survey: str
     options: str = "--independent"
     label: str = ""  # where the same images are localised twice
+    package: str = "map"
 
     @property
     def poses(self) -> str:
@@ -42,13 +43,13 @@ class Queries:
     def localize(self, bench: Workbench) -> Run:
         """Run ``fleetmap localize``."""
         outputs = f"--trajectory {self.poses}.tum --covariances {self.poses}.csv"
-        words = f"localize {self.name}.mcap --map {self.survey}-map {outputs} {self.options}"
+        words = f"localize {self.name}.mcap --map {self.survey}-{self.package} {outputs} {self.options}"
         return bench.once(words.rstrip())
 
     def pair(self, bench: Workbench, recorded_from_query: Pose) -> CameraPair:
         """The two cameras as the map has the survey's."""
         recorded = open_drive(bench.folder / f"{self.survey}.mcap").camera
-        mapped = open_package(bench.folder / f"{self.survey}-map").manifest.camera.to_camera()
+        mapped = open_package(bench.folder / f"{self.survey}-{self.package}").manifest.camera.to_camera()
         return CameraPair.of(recorded_from_query, recorded, mapped)
 
     def images(self, bench: Workbench) -> int:
