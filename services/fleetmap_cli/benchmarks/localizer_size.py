@@ -1,4 +1,4 @@
-"""How small a map may be: what localizers fetch per kilometre, and how often and how exactly they are localised."""
+"""How small a map may be: what localizers fetch per kilometre, against how often and how exactly they find out."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ _EYES = {  # of the second camera -> options of the perturbing, degrees to the r
 
 SIZE = Group(
     "Map size",
-    "One map, of which landmarks and keyframes are chosen by `fleetmap map --budget-mb-per-km`; *MB/km*: all cells "
-    "together, on the way driven, so what a localizer fetches. Every query on its own; *%*: images with a "
+    "One map, of which landmarks and keyframes are chosen by `fleetmap map --budget-mb-per-km`; *MB/km*: all "
+    "cells together, on the way driven: what a localizer fetches. Every query on its own; *%*: images with a "
     "pose that is not wrong, *m*: median error. Dark: gamma 2.0, noise 4; yawed: by 8 deg. In the simulation the "
     "second vehicle drives in the other lane, at dusk, with another camera.",
     ("MB/km", "landmarks/km", *(f"{eyes} {unit}" for eyes in (*_EYES, "tracking") for unit in ("%", "m"))),
