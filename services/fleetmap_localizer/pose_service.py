@@ -6,8 +6,6 @@ import hashlib
 import time
 from collections.abc import Callable
 from threading import Lock
-from types import TracebackType
-from typing import Self
 
 from pydantic import ValidationError
 
@@ -46,7 +44,7 @@ _PROBLEMS: tuple[ProblemRow, ...] = (  # the first row that fits counts
 
 
 class PoseService:
-    """Answers while it stands; use it in a ``with`` statement, or close it.
+    """Answers while it stands; close it in the end.
 
     Args:
         endpoint: ``tcp/HOST:PORT`` to listen on.
@@ -69,14 +67,6 @@ class PoseService:
         self._admission, self._supplies, self._settings = Admission(connect), supplies, settings
         handlers = {protocol.HELLO: self._hello, protocol.LOCALIZE: self._localize}
         self._service = RequestService(endpoint, handlers, problem_of)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """Answer what has been asked, take no more, and hang up."""

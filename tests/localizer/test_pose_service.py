@@ -7,6 +7,7 @@ import socket
 import struct
 import zlib
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -82,7 +83,7 @@ def chain(mapped_street, second_drive, tmp_path_factory: pytest.TempPathFactory)
             client.publish(package.manifest_bytes, package.part_bytes)
         headers = {"Authorization": f"Bearer {READING}"}
         with (
-            PoseService(localizer, lambda token: MapClient(endpoint, token=token), supplies),
+            closing(PoseService(localizer, lambda token: MapClient(endpoint, token=token), supplies)),
             httpx.Client(base_url=server.http_url, headers=headers, timeout=60.0) as http,
         ):
             yield Chain(endpoint, localizer, http, question)
@@ -205,12 +206,14 @@ def test_while_the_map_server_is_away_nobody_is_let_in(chain, second_drive):
     def connect(token: str | None) -> MapClient:
         raise ServerUnreachableError("no map server answers")
 
-    endpoint, pool = free_endpoint(), None
-    with PoseService(endpoint, connect, Supplies(lambda camera, near: pytest.fail("it let somebody in"))):
-        pool = LocalizerPool([endpoint])
-        with pytest.raises(NoLocalizerError, match="no map server answers"):
-            pool.localize(chain.question, encoded(second_drive.frames[5].image), READING)
-        pool.close()
+    endpoint = free_endpoint()
+    supplies = Supplies(lambda camera, near: pytest.fail("it let somebody in"))
+    with (
+        closing(PoseService(endpoint, connect, supplies)),
+        closing(LocalizerPool([endpoint])) as pool,
+        pytest.raises(NoLocalizerError, match="no map server answers"),
+    ):
+        pool.localize(chain.question, encoded(second_drive.frames[5].image), READING)
 
 
 def test_a_vehicle_that_asks_for_maps_there_is_told_where_it_is(chain):

@@ -63,7 +63,7 @@ def locator(server: ServerAccess, zenoh: str, cache: Path | None) -> None:
     with (
         stop_on_signals("stopping once what was asked is answered; once more to stop at once") as stop,
         closing(Supplies(open_supply)) as supplies,
-        PoseService(zenoh, connect_as, supplies, settings),
+        closing(PoseService(zenoh, connect_as, supplies, settings)),
     ):
         click.echo(f"locating in the maps of {server.endpoint}: Zenoh {zenoh}")
         stop.wait()

@@ -61,7 +61,8 @@ def address(tmp_path_factory, make_map, publish, serving, module_endpoint, locat
         stack.enter_context(ZenohFace(library, module_endpoint))  # where the localizer asks who may ask it
         supplies = Supplies(lambda camera, near: WholeMaps((), camera, LocalizerSettings()))
         connect = partial(MapClient, module_endpoint)
-        stack.enter_context(PoseService(locator_endpoint, lambda token: connect(token=token), supplies))
+        service = PoseService(locator_endpoint, lambda token: connect(token=token), supplies)
+        stack.enter_context(contextlib.closing(service))
         pool = stack.enter_context(contextlib.closing(LocalizerPool([locator_endpoint])))
         yield stack.enter_context(serving(create_app(library, localizers=pool)))
 
