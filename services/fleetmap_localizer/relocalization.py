@@ -32,6 +32,11 @@ class Located:
         """Landmarks that agree with the pose."""
         return self.fit.answer.inlier_count
 
+    @property
+    def share(self) -> float:
+        """Of the landmarks that should be in view, those that agree; does not depend on the map's density."""
+        return self.inlier_count / max(len(self.fit.predicted_px), 1)
+
     def utm_from_cam(self) -> Pose:
         """The camera's pose as easting, northing, ellipsoidal height."""
         pose = self.fit.answer.map_from_cam
@@ -62,9 +67,9 @@ def relocalize(
     if not found:
         return "the image shows no place that the map knows"
     best = max(found, key=lambda each: each.inlier_count)
-    if any(_is_rival(each, best, settings.relocalization.max_rival) for each in found):
+    if any(_is_rival(each, best, camera, options) for each in found):
         return "the image could be of two places, which look too much alike"
-    if not is_trustworthy(best.fit, camera, settings.relocalization.gate):
+    if not is_trustworthy(best.fit, camera, options.gate):
         return f"too little of the image agrees with the likeliest place ({best.inlier_count} landmarks)"
     return best
 
@@ -80,9 +85,21 @@ def _is_found(one: Located, view: MapView, map_from_cam: Pose) -> bool:
     return one.view is view and is_same_place(map_from_cam, one.fit.answer.map_from_cam)
 
 
-def _is_rival(one: Located, best: Located, max_rival: float) -> bool:
-    """Whether another place explains the image almost as well; overlapping maps tell of the same place."""
-    return one.inlier_count >= max_rival * best.inlier_count and not is_same(one, best)
+def _is_rival(one: Located, best: Located, camera: Camera, settings: RelocalizationSettings) -> bool:
+    """Whether another place explains the image almost as well; overlapping maps tell of the same place.
+
+    A place that could be the answer if it were alone must be beaten clearly: by more than counts vary by chance,
+    and also in the share of its landmarks that agree. Otherwise a dense map of a street that looks much the same
+    would outdo the sparse map of the right one.
+    """
+    if is_same(one, best):
+        return False
+    if one.inlier_count >= settings.max_rival * best.inlier_count:
+        return True
+    if not is_trustworthy(one.fit, camera, settings.gate):
+        return False
+    lead, spread = best.inlier_count - one.inlier_count, np.sqrt(best.inlier_count + one.inlier_count)
+    return bool(one.share >= settings.max_rival * best.share or lead < settings.min_lead_sigmas * spread)
 
 
 def _candidate_places(

@@ -56,6 +56,7 @@ class RelocalizationSettings:
     ransac_error_px: float = 6.0
     radii_px: tuple[float, ...] = (12.0, 5.0)  # windows around the projections, round after round
     max_rival: float = 0.8  # another place with this share of the best's inliers makes the answer ambiguous
+    min_lead_sigmas: float = 2.0  # of the best's inliers over those of a place that could be the answer as well
     gate: GateSettings = GateSettings(
         chance_ratio=0.015, max_chance=1e-6, min_coverage=0.55, max_position_sigma_m=0.2
     )
