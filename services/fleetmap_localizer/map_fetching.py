@@ -24,7 +24,7 @@ from fleetmap_localizer.map_source import Circle, MapFolder, MapServer, MapSourc
 _log = logging.getLogger(__name__)
 
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 1.0, 60.0
-_LISTEN_S = 60.0
+_LISTEN_S, _LISTEN_AGAIN_S = 60.0, 5.0
 
 
 @dataclass(frozen=True)
@@ -165,6 +165,7 @@ class Fetcher:
             self._wishes = tuple(each for each in self._wishes if each is not wish)
 
     def _fetch_catalogue(self, source: MapSource, wish: CatalogueWish) -> None:
+        news_before = self._shelf.news_count
         try:
             entries = source.maps(wish.around, wish.max_count)
         except ServerRefusedError as error:  # the one map that is wanted is not, or no longer, there
@@ -173,6 +174,8 @@ class Fetcher:
                 self.error = error
             entries = []
         self._shelf.put_catalogue(wish.around, entries)
+        if self._shelf.news_count != news_before:
+            self._shelf.doubt_catalogue()  # the answer may be older than the news
         if self._cache is not None and not self.error:
             self._cache.keep_catalogue(str(self._origin), self._shelf.entries())
 
@@ -232,13 +235,12 @@ class Fetcher:
                 entry = announcements.next(_LISTEN_S)
             except ServerError as error:
                 self._is_lost(error)
-                self._closed.wait(_LISTEN_S)
+                self._closed.wait(_LISTEN_AGAIN_S)
                 continue
             if entry is None:
                 self._shelf.doubt_catalogue()  # nobody announces what is retired
-            else:
-                self._shelf.put_news(entry)
-            self._on_change()
+            if entry is None or self._shelf.put_news(entry):
+                self._on_change()
 
     def _is_lost(self, error: ServerError) -> None:
         if self._closed.is_set() or self.error is not None:

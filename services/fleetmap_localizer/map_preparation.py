@@ -95,7 +95,8 @@ class Preparer:
         hint = ""
         if isinstance(self._origin, MapServer):
             hint = f"; 'fleetmap maps list --server {self._origin.endpoint}' shows what it has"
-        return NoPoseError(f"{self._origin} has no map{place}{hint}")
+        readable = " that can be read" if self._shelf.entries() and around is None else ""
+        return NoPoseError(f"{self._origin} has no map{readable}{place}{hint}")
 
     def _offered(self, where: Whereabouts, urgent: list[Wish]) -> list[MapOffer]:
         """The latest versions of the maps around; until one has come, the version in use stands in for it."""

@@ -36,6 +36,7 @@ class Shelf:
         self._manifests: dict[str, Manifest] = {}
         self._parts: dict[str, bytes] = {}
         self._missing: dict[str, float] = {}  # hash -> time at which to ask for it again
+        self.news_count = 0
 
     def entries(self) -> list[MapEntry]:
         """The latest versions known of, newest survey first."""
@@ -59,13 +60,19 @@ class Shelf:
             self._entries = elsewhere | fresh
             self._asked = [circle] if circle is None else [*self._asked[-3:], circle]
 
-    def put_news(self, entry: MapEntry) -> None:
-        """A version that became the latest, or was retired; far from all that was asked it is passed over."""
+    def put_news(self, entry: MapEntry) -> bool:
+        """A version that became the latest, or was retired; False if it is old, or far from all that was asked."""
         with self._lock:
+            known = self._entries.get(entry.map_id)
+            is_here = known is not None or any(asked is None or asked.holds(entry) for asked in self._asked)
+            if known == entry or not is_here:
+                return False
+            self.news_count += 1
             if entry.retired:
                 self._entries.pop(entry.map_id, None)
-            elif any(asked is None or asked.holds(entry) for asked in self._asked):
+            else:
                 self._entries[entry.map_id] = entry
+            return True
 
     def doubt_catalogue(self) -> None:
         """It is to be asked anew; what it told counts until then."""

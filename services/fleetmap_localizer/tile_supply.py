@@ -93,8 +93,7 @@ class TileSupply:
             self._changed.wait_for(self._is_ready)
             if self._error is not None:
                 raise self._error
-            assert self._views is not None
-            return self._views
+            return self._views or ()
 
     def moved(self, pose: PoseEstimate | NoPose) -> None:
         """Follow the vehicle."""
@@ -114,7 +113,7 @@ class TileSupply:
 
     def _is_ready(self) -> bool:
         is_current = self._views is not None and (not self._in_step or self._settled_for is self._asked_for)
-        return is_current or self._error is not None
+        return is_current or self._error is not None or self._is_closed
 
     def _note_news(self) -> None:
         with self._changed:

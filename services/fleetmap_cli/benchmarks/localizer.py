@@ -2,12 +2,24 @@
 
 from __future__ import annotations
 
-from fleetmap_cli.benchmarks import localizer_drives, localizer_honesty, localizer_size, localizer_speed, localizer_start
+from fleetmap_cli.benchmarks import (
+    localizer_drives,
+    localizer_honesty,
+    localizer_size,
+    localizer_speed,
+    localizer_start,
+)
 from fleetmap_cli.benchmarks.row import Benchmark
 
 BENCHMARK = Benchmark(
     "localizer",
     "images of one vehicle in the maps of another",
-    (*localizer_drives.ROWS, *localizer_honesty.ROWS, *localizer_size.ROWS, *localizer_speed.ROWS, *localizer_start.ROWS),
+    (
+        *localizer_drives.ROWS,
+        *localizer_honesty.ROWS,
+        *localizer_size.ROWS,
+        *localizer_speed.ROWS,
+        *localizer_start.ROWS,
+    ),
     shares_work=True,
 )
