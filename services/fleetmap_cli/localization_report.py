@@ -56,7 +56,7 @@ def finish(outputs: PoseOutputs, result: LocalizedDrive, paced: PacedFrames | No
 
     Raises:
         NoPoseError: not one image could be localised.
-        FleetmapError: what ended the run early.
+        RunError: what ended the run early.
         StorageError: a file cannot be written.
     """
     written = outputs.write(result)

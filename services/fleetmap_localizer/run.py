@@ -13,7 +13,7 @@ import numpy as np
 from fleetmap.camera import Camera
 from fleetmap.covariances import PoseCovariances
 from fleetmap.drive import Frame
-from fleetmap.errors import FleetmapError, NoPoseError
+from fleetmap.errors import NoPoseError, RunError
 from fleetmap.trajectory import Trajectory
 from fleetmap.vision.features import FeatureExtractor, Features, FeatureSettings
 from fleetmap_localizer.dead_reckoning import DeadReckoning
@@ -117,7 +117,7 @@ def localize_drive(
 ) -> LocalizedDrive:
     """Localise every image of a drive in the maps that lie around it.
 
-    What ends the run early, be it Ctrl-C, a damaged recording or the server, is kept beside the answers so far.
+    What ends the run early, be it Ctrl-C or the server, is kept beside the answers so far.
 
     Args:
         frames: the images in time order.
@@ -127,6 +127,11 @@ def localize_drive(
         independent: every image is a query on its own, of which not even the supply learns.
         reckoning: predicts poses where images give none.
         looks_ahead: features of the next images are found meanwhile; not for frames that come when they are due.
+
+    Raises:
+        DriveError: the recording is damaged.
+        CalibrationError: images of another size than the camera's calibration.
+        MapPackageError: the folder holds no map.
     """
     settings = settings or LocalizerSettings()
     localizer = Localizer(camera, (), settings)
@@ -146,7 +151,7 @@ def localize_drive(
                 answers.append(_with_prediction(answer, reckoning))
                 if not independent:
                     supply.moved(answers[-1])
-    except (FleetmapError, KeyboardInterrupt) as error:
+    except (RunError, KeyboardInterrupt) as error:
         ended_by = error
     return LocalizedDrive(tuple(answers), tuple(map_ids), ended_by)
 

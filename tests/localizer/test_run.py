@@ -11,7 +11,7 @@ import pytest
 from fleetmap.drive import Frame, WheelSpeed
 from fleetmap.drives import open_drive
 from fleetmap.drives.ros2_writer import DriveWriter
-from fleetmap.errors import DriveError, NoPoseError
+from fleetmap.errors import DriveError, NoPoseError, ServerError
 from fleetmap_localizer.dead_reckoning import DeadReckoning
 from fleetmap_localizer.map_source import read_map
 from fleetmap_localizer.map_supply import WholeMaps
@@ -119,7 +119,7 @@ class Shutdown:
         raise self._error
 
 
-@pytest.mark.parametrize("error", [KeyboardInterrupt(), DriveError("an image is damaged")])
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), ServerError("the server is gone")])
 def test_what_ends_a_run_early_takes_nothing_away(supply, second_drive, error) -> None:
     frames = Shutdown(second_drive.frames[:3], error)
     result = localize_drive(frames, second_drive.camera, supply)
@@ -129,6 +129,12 @@ def test_what_ends_a_run_early_takes_nothing_away(supply, second_drive, error) -
     nothing = localize_drive(Shutdown([], error), second_drive.camera, supply)
     with pytest.raises(type(error)):
         nothing.require_pose()
+
+
+def test_a_damaged_recording_is_refused(supply, second_drive) -> None:
+    frames = Shutdown(second_drive.frames[:2], DriveError("an image is damaged"))
+    with pytest.raises(DriveError, match="damaged"):
+        localize_drive(frames, second_drive.camera, supply)
 
 
 def test_a_drive_that_no_map_knows_says_which_and_why(supply, foreign_drive) -> None:
