@@ -126,11 +126,11 @@ def test_a_tampered_chunk_is_refused_and_leaves_nothing(connection, standing_ser
 
 
 def test_a_manifest_that_is_none_is_refused_before_any_part_is_sent(connection):
-    data = b'{"format": {"name": "fleetmap-map", "major": 2}}'
+    data = b'{"format": {"name": "fleetmap-map", "major": 9}}'
     version = hashlib.sha256(data).hexdigest()
     place = {"version": version, "sha256": version, "size_bytes": len(data), "offset": 0}
     status, detail = problem(connection, "upload/chunk", data, **place)
-    assert (status, "map format 2" in detail) == (422, True)
+    assert (status, "map format 9" in detail) == (422, True)
     assert problem(connection, "upload/commit", version=version)[0] == 404
 
 

@@ -97,6 +97,7 @@ class _RemoteLocalizer:
     def localize(self, request: LocalizeRequest, image: bytes, token: str | None) -> Localized:
         connection = self._connected()
         words = {name: str(value) for name, value in request.model_dump(exclude_none=True).items()}
+        begun_s = time.monotonic()
         self._count(1)
         try:
             question = connection.ask(protocol.LOCALIZE, words, image, self._answer_s, bulk=True, token=token)
@@ -106,6 +107,7 @@ class _RemoteLocalizer:
                 raise
             raise _NotBegunError(f"{self._endpoint}: {error.problem.detail}") from error
         except NoAnswerError as error:
+            self._doubt(connection, time.monotonic() - begun_s)
             raise NoLocalizerError(
                 f"the localizer at {self._endpoint} was lost with this image, or took longer than "
                 f"{self._answer_s:g} s; asking again may help"
@@ -114,6 +116,14 @@ class _RemoteLocalizer:
             raise NoLocalizerError(f"what listens at {self._endpoint} answers what is no pose") from error
         finally:
             self._count(-1)
+
+    def _doubt(self, connection: Connection, waited_s: float) -> None:
+        """After no answer. What ended before its time was lost with its connection, also if Zenoh does not say so
+        yet; where the time was over, others may still be served over it.
+        """
+        self._avoided_until_s = time.monotonic() + _AVOIDED_S
+        if waited_s < 0.9 * self._answer_s:
+            connection.close()
 
     def _connected(self) -> Connection:
         with self._lock:
