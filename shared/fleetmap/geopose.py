@@ -29,7 +29,7 @@ _UNIT_TOLERANCE = 1e-6  # of a quaternion's length
 
 
 class _Model(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False, defer_build=True)
+    model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
 
 
 class GeoPosition(_Model):

@@ -33,7 +33,7 @@ _BoxLonLat = tuple[LonDeg, LatDeg, LonDeg, LatDeg]
 
 
 class _Model(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False, defer_build=True)
+    model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
 
 
 class DriveFinding(_Model):

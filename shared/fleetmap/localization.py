@@ -16,7 +16,7 @@ CameraText = Annotated[str, StringConstraints(min_length=1, max_length=MAX_CAMER
 
 
 class _Model(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False, defer_build=True)
+    model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
 
 
 class LocalizeRequest(_Model):

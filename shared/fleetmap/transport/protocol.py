@@ -64,7 +64,7 @@ AreaLonLat = Annotated[tuple[LonDeg, LatDeg, LonDeg, LatDeg], BeforeValidator(_f
 
 
 class _Message(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False, defer_build=True)
+    model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
 
 
 class Hello(_Message):
