@@ -57,6 +57,7 @@ def test_help_teaches(fleetmap):
         "--gnss",
         "[none|mapping|final|full]",
         "--watch",
+        "--budget-mb-per-km",
         "--set",
         "exit code 3",
         "Examples:",
@@ -77,9 +78,23 @@ def test_a_survey_drive_becomes_a_map_and_a_trajectory(survey, mapped_survey):
     assert package.manifest.provenance.drive == "survey.mcap"
     assert package.manifest.quality.publishable
     assert len(package.visual_map().keyframes) == package.manifest.quality.keyframes
+    chosen = package.manifest.localizable
+    assert chosen is not None
+    assert 0.9e5 < chosen.size_bytes <= 1.0e5  # 1 MB/km, and of less than 100 m as if they were
+    assert f"cells:         {chosen.size_bytes / 1e6:.2f} MB, {chosen.keyframes} keyframes and" in run.stdout
+    covariances = package.localization_map().keyframes.covariances
+    assert covariances is not None
+    assert np.isfinite(covariances).all()
     trajectory = read_trajectory(mapped_survey.trajectory)
     np.testing.assert_array_equal(trajectory.stamps_ns, survey.truth.stamps_ns // 1000 * 1000)
     assert 0.005 < survey.errors_m(trajectory).mean() < 0.1
+
+
+def test_a_budget_without_room_is_refused_before_the_work_begins(fleetmap, tmp_path):
+    code, out, err = fleetmap("map", "a.mcap", "--output", tmp_path / "map", "--budget-mb-per-km", "0.01")
+    assert (code, out) == (2, "")
+    assert err.startswith("error: the mapper setting 'cells.budget_mb_per_km' cannot be 0.01")
+    assert err.endswith("must be 0 or at least 0.05: keyframes need some room\n")
 
 
 def test_the_trajectory_is_tum_text_in_utm(mapped_survey):
