@@ -92,23 +92,27 @@ def encode(message: Any) -> bytes:
 
 
 def _typestore_of(topic: Topic) -> Typestore:
-    """One store per topic: two recorders' definitions of one type may differ within one file."""
+    """One store per definition: two recorders' definitions of one type may differ within one file."""
     if not topic.schema_text.strip():
         return get_typestore(Stores.ROS1_NOETIC) if topic.message_encoding == "ros1" else standard_typestore()
-    message_type = ros2_name(topic.message_type)
-    typestore = get_typestore(Stores.EMPTY)
     try:
-        if topic.schema_encoding == "ros2idl":
-            for document in _idl_documents(topic.schema_text):
-                typestore.register(get_types_from_idl(document))
-        else:
-            typestore.register(get_types_from_msg(topic.schema_text, message_type))
-        typestore.get_msgdef(message_type)
+        return _typestore_by(topic.schema_text, topic.schema_encoding, ros2_name(topic.message_type))
     except Exception as error:  # a parser fed with foreign text
         raise DriveError(
             f"the message definition of {topic.name} ({topic.message_type}) cannot be understood:"
             f" {' '.join(str(error).split())}"
         ) from error
+
+
+@lru_cache(maxsize=32)  # a topic is often opened anew, and parsing takes 10 ms
+def _typestore_by(schema_text: str, schema_encoding: str, message_type: str) -> Typestore:
+    typestore = get_typestore(Stores.EMPTY)
+    if schema_encoding == "ros2idl":
+        for document in _idl_documents(schema_text):
+            typestore.register(get_types_from_idl(document))
+    else:
+        typestore.register(get_types_from_msg(schema_text, message_type))
+    typestore.get_msgdef(message_type)
     return typestore
 
 
