@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from fleetmap_cli.benchmarks import (
     localizer_drives,
+    localizer_gaps,
     localizer_honesty,
     localizer_size,
     localizer_speed,
@@ -16,6 +17,7 @@ BENCHMARK = Benchmark(
     "images of one vehicle in the maps of another",
     (
         *localizer_drives.ROWS,
+        *localizer_gaps.ROWS,
         *localizer_honesty.ROWS,
         *localizer_size.ROWS,
         *localizer_speed.ROWS,

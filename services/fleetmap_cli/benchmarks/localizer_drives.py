@@ -39,6 +39,7 @@ PLACED = Group(
     ("mean m", "median m", "rmse m", "std m", "p95 m", "max m", "posed"),
 )
 _PLAIN = "100 %; median <= 0.03 m, p95 <= 0.08 m, rotation <= 0.1 deg"
+_SECOND = "--drive 2 --lane-m 3.5 --speed-mps 11 --look dusk --camera other.yaml"
 _SIMULATED_CAMERA = Camera(1000, 480, 640.0, 640.0, 503.0, 236.0, (-0.25, 0.08, 1e-3, -5e-4, 0.0))
 
 
@@ -54,9 +55,16 @@ class SimulatedDrives:
         drive = f"{self.world} --length-m {self.length_m:g}"
         write_camera(bench.folder / "other.yaml", _SIMULATED_CAMERA, force=True)
         bench.once(f"simulate sim-survey.mcap {drive} --drive 1")
-        other = "--lane-m 3.5 --speed-mps 11 --look dusk --camera other.yaml --gnss none"
-        bench.once(f"simulate sim-second.mcap {drive} --drive 2 {other}")
+        bench.once(f"simulate sim-second.mcap {drive} {_SECOND} --gnss none")
         _map(bench, "sim-survey")
+
+    def make_sensed(self, bench: Workbench) -> str:
+        """The second vehicle with IMU, wheel speeds and a coarse receiver on board; the recording's name."""
+        self.make(bench)
+        on_board = "--sensors imu,wheel --gnss consumer --gnss-interval-s 0.2 --antenna-offset -1.2,-0.3,0.4"
+        drive = f"{self.world} --length-m {self.length_m:g} {_SECOND}"
+        bench.once(f"simulate sim-sensed.mcap {drive} {on_board} --images-from sim-second.mcap")
+        return "sim-sensed"
 
 
 def query_rows(simulated: SimulatedDrives) -> tuple[Row, ...]:
