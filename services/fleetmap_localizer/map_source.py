@@ -108,8 +108,9 @@ class ServerMaps:
         if self._map_id is not None:
             return self._client.versions(self._map_id)[:1]
         if around is None:
-            return self._client.list_maps()[:max_count]
-        return self._client.list_maps((around.lat_deg, around.lon_deg), around.radius_m)[:max_count]
+            return self._client.list_maps(max_count=max_count)
+        place = around.lat_deg, around.lon_deg
+        return self._client.list_maps(place, around.radius_m, max_count=max_count)
 
     def manifest(self, map_id: str, version: str) -> bytes:
         """Fetched, and verified by its hash."""
@@ -128,8 +129,8 @@ class ServerMaps:
         return True
 
     def announcements(self) -> Announcements:
-        """Of all the server's maps."""
-        return self._client.announcements()
+        """Of all the server's maps; those of now are asked for where they are needed."""
+        return self._client.announcements(news_only=True)
 
     def close(self) -> None:
         """Hang up."""

@@ -43,6 +43,20 @@ def test_a_late_joiner_hears_the_last_version_of_each_map_and_then_every_new_one
         assert heard.next(0.2) is None
 
 
+def test_who_wants_news_only_does_not_hear_of_what_was_there_before(server, make_map):
+    maps = [make_map(part_sizes=(100,), seed=seed) for seed in range(3)]
+    with MapClient(server.zenoh_endpoint) as client, MapClient(server.zenoh_endpoint) as publisher:
+        publish(publisher, make_map(map_id="other", part_sizes=(100,), seed=9))
+        publish(publisher, maps[0])
+        heard = client.announcements(news_only=True)
+        assert heard.next(0.0) is None
+        for one in maps[1:]:
+            publish(publisher, one)
+            assert (entry := heard.next(10.0)) is not None
+            assert entry.version == one.version
+        assert heard.next(0.0) is None
+
+
 def test_announcements_go_on_after_a_restart_of_the_server(tmp_path, endpoint, make_map):
     settings = ServerSettings(tmp_path, endpoint, http_port=0)
     with ExitStack() as clients:

@@ -15,21 +15,25 @@ from fleetmap.transport.link import ServerLink
 from fleetmap.transport.session import Connection
 
 _LOOK_EVERY_S = 0.2  # whether the connection still stands
+_END = 2**63 - 1  # nothing comes after it, and every hint names something before
 _ASK_EVERY_S = 60.0  # also without a word; what is announced can get lost with a server
 
 
 class Announcements:
     """Each map's latest version once: those of now, then every new one; iterate over it, or call ``next``.
 
+    ``news_only`` leaves out those of now, and with them what is announced while there is no connection.
+
     What servers announce is a hint to ask the catalogue, never believed by itself. So it does not matter whether a
     hint comes late, twice, from several servers, or not at all because the server restarts: once there is a
     connection again, the catalogue tells what was missed.
     """
 
-    def __init__(self, link: ServerLink) -> None:
+    def __init__(self, link: ServerLink, *, news_only: bool = False) -> None:
         self._link = link
+        self._begin_after = _END if news_only else 0
         self._catalogue_id = link.hello.catalogue_id
-        self._asked_after = 0
+        self._asked_after = self._begin_after
         self._known: dict[str, tuple[int, str]] = {}  # map_id -> number and version told last
         self._found: deque[MapEntry] = deque()
         self._news = Event()
@@ -83,7 +87,7 @@ class Announcements:
         self._news.clear()
         if self._link.hello.catalogue_id != self._catalogue_id:  # another store in the server's place
             self._catalogue_id = self._link.hello.catalogue_id
-            self._asked_after, self._known = 0, {}
+            self._asked_after, self._known = self._begin_after, {}
         more = True
         while more:
             named = {"after": self._asked_after}

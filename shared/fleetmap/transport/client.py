@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Mapping
+from itertools import islice
 from pathlib import Path
 from types import TracebackType
 from typing import Self, TypeVar
@@ -99,6 +100,7 @@ class MapClient:
         area_lonlat: AreaLonLat | None = None,
         from_ns: int | None = None,
         until_ns: int | None = None,
+        max_count: int | None = None,
     ) -> list[MapEntry]:
         """The latest version of every map, newest first.
 
@@ -109,6 +111,7 @@ class MapClient:
             area_lonlat: only maps whose trajectory meets this box.
             from_ns: only maps whose survey ended then or later (UTC since the epoch).
             until_ns: only maps whose survey began then or earlier.
+            max_count: the first so many, without asking for the others; None: all.
 
         Raises:
             InputError: there is no such place on the globe.
@@ -118,11 +121,11 @@ class MapClient:
             if not (abs(near[0]) <= 90.0 and abs(near[1]) <= 180.0):
                 raise InputError(f"latitude {near[0]}, longitude {near[1]} is no place on the globe")
             where |= {"lat_deg": near[0], "lon_deg": near[1], "radius_m": radius_m}
-        return self._all_maps(_given(**where))
+        return list(islice(self._each_map(_given(**where)), max_count))
 
     def versions(self, map_id: str) -> list[MapEntry]:
         """All versions of a map that are not retired, newest first."""
-        return self._all_maps({"map_id": map_id, "versions": "all"})
+        return list(self._each_map({"map_id": map_id, "versions": "all"}))
 
     def rollback(self, map_id: str, version: str, latest: str | None = None) -> MapEntry:
         """Make the content of an older version the latest again.
@@ -140,12 +143,13 @@ class MapClient:
 
     def retire(self, map_id: str, version: str | None = None) -> int:
         """Take a version that is not the latest, or the whole map, out of service; how many numbers it was."""
-        named = _given(map_id=map_id, version=version)
-        return self._link.request(protocol.Retired, protocol.MAPS_RETIRE, named).retired
+        return self._link.request(
+            protocol.Retired, protocol.MAPS_RETIRE, _given(map_id=map_id, version=version)
+        ).retired
 
-    def announcements(self) -> Announcements:
-        """The latest version of each map, and then each new one as it comes."""
-        return Announcements(self._link)
+    def announcements(self, *, news_only: bool = False) -> Announcements:
+        """The latest version of each map, unless ``news_only``, and then each new one as it comes."""
+        return Announcements(self._link, news_only=news_only)
 
     def manifest(self, map_id: str, version: str | None = None) -> bytes:
         """The manifest of a map, byte for byte; ``version`` as in ``rollback``, without it that of the latest.
@@ -311,8 +315,8 @@ class MapClient:
         """Queue a job that failed or was cancelled once more."""
         return self._link.request(JobEntry, protocol.JOBS_RETRY, {"job_id": job_id})
 
-    def _all_maps(self, where: Parameters) -> list[MapEntry]:
-        return [entry for page in self._pages(MapPage, protocol.MAPS, where) for entry in page.maps]
+    def _each_map(self, where: Parameters) -> Iterator[MapEntry]:
+        return (entry for page in self._pages(MapPage, protocol.MAPS, where) for entry in page.maps)
 
     def _pages(self, kind: type[_Page], operation: str, where: Parameters) -> Iterator[_Page]:
         """A list's pages from the first to the last."""
