@@ -8,6 +8,8 @@ import signal
 import socket
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -95,12 +97,19 @@ def test_a_locator_serves_a_servers_users_until_it_is_killed(
         assert 0.0 < distance_m(remote, second_drive, 3) < 0.3
         code, out, _ = fleetmap("locate", folder / "3.jpg", *common, "--cache", tmp_path / "own")
         assert (code, json.loads(out)) == (0, remote)  # what the locator finds is what one finds oneself
-        locator.kill()
-        locator.communicate(timeout=20)
         form = {"image": (folder / "3.jpg").read_bytes(), "camera": (folder / "camera.yaml").read_bytes()}
-        answer = httpx.post(f"{server.http_url}/localize", files=form, timeout=60.0)
-        assert (answer.status_code, answer.json()["title"]) == (503, "No localizer")
-        assert localizer in answer.json()["detail"]
+        post = partial(httpx.post, f"{server.http_url}/localize", files=form, timeout=60.0)
+        os.kill(locator.pid, signal.SIGSTOP)  # it takes an image, and does not come to answer it
+        with ThreadPoolExecutor(1) as pool:
+            asked = pool.submit(post)
+            assert httpx.get(f"{server.http_url}/healthz").status_code == 200
+            assert not asked.done()
+            locator.kill()
+            answers = [asked.result(60.0), post()]
+        locator.communicate(timeout=20)
+        for answer in answers:
+            assert (answer.status_code, answer.json()["title"]) == (503, "No localizer")
+            assert localizer in answer.json()["detail"]
 
 
 def test_a_locator_that_is_asked_to_end_ends_in_good_order():
