@@ -102,7 +102,7 @@ class MapClient:
         until_ns: int | None = None,
         max_count: int | None = None,
     ) -> list[MapEntry]:
-        """The latest version of every map, newest first.
+        """The latest version of every map, newest first; of the first ``max_count``, if that is given.
 
         Args:
             near: latitude and longitude in degrees; only the maps whose trajectory passes within ``radius_m`` of
@@ -111,7 +111,6 @@ class MapClient:
             area_lonlat: only maps whose trajectory meets this box.
             from_ns: only maps whose survey ended then or later (UTC since the epoch).
             until_ns: only maps whose survey began then or earlier.
-            max_count: the first so many, without asking for the others; None: all.
 
         Raises:
             InputError: there is no such place on the globe.
@@ -143,9 +142,8 @@ class MapClient:
 
     def retire(self, map_id: str, version: str | None = None) -> int:
         """Take a version that is not the latest, or the whole map, out of service; how many numbers it was."""
-        return self._link.request(
-            protocol.Retired, protocol.MAPS_RETIRE, _given(map_id=map_id, version=version)
-        ).retired
+        named = _given(map_id=map_id, version=version)
+        return self._link.request(protocol.Retired, protocol.MAPS_RETIRE, named).retired
 
     def announcements(self, *, news_only: bool = False) -> Announcements:
         """The latest version of each map, unless ``news_only``, and then each new one as it comes."""
