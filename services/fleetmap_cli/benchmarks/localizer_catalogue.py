@@ -1,7 +1,7 @@
 """Where am I, among all streets there are? Simulated streets and both real maps, asked without a prior.
 
-Streets of a pair are of one shape, with half of their walls and road painted alike: their places differ for sure
-only where enough of what differs is in view, and elsewhere "no pose" is the right answer.
+Twins are streets of one shape, a quarter of whose walls and pieces of road are the same to the last brick. Where
+little of what differs is in view, "no pose" is the right answer.
 """
 
 from __future__ import annotations

@@ -66,8 +66,8 @@ class _SensorList(click.ParamType[frozenset[str]]):
     show_default=True,
     type=_SEED,
     metavar="N",
-    help="Other than 0: a street that could be taken for the world's own. Of the same shape, half of its walls, "
-    "roofs, hedges and pieces of road painted otherwise, and other cars.",
+    help="Other than 0: a street that could be taken for the world's own. Of the same shape, three quarters of "
+    "its walls, roofs, hedges and pieces of road painted otherwise, and other cars.",
 )
 @click.option(
     "--site",

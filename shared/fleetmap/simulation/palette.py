@@ -22,7 +22,7 @@ Rng = np.random.Generator
 
 STOREY_M = 2.9
 _CRISPNESS, _DETAIL_PX = 1.0, 4.0
-_REPAINTED = 0.5  # share of all picks that differ between variants of a world
+_REPAINTED = 0.75  # share of all picks that differ between variants of a world
 
 
 class WallPaint(Protocol):
@@ -81,8 +81,8 @@ class FreshPaint:
 class Palette:
     """A pool of textures, the same for the same seed whatever order they are asked for in.
 
-    ``richness`` is how many of each kind there are, as a factor. In a ``variant`` other than 0, half of all that
-    is picked is painted otherwise; which half, its number says.
+    ``richness`` is how many of each kind there are, as a factor. In a ``variant`` other than 0, three
+    quarters of all that is picked are painted otherwise; which, its number says.
     """
 
     def __init__(self, seed: int, builder: SurfaceBuilder, richness: float = 1.0, variant: int = 0) -> None:

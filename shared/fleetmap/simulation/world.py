@@ -119,8 +119,9 @@ def build_world(
             "open": a circuit on a wide place; "facades": a circuit among houses that look alike; "street": one
             bend, no traffic.
         length_m: of the path; of one lap on a circuit.
-        variant: other than 0, a street that could be taken for the seed's own: of the same shape, with half of its
-            walls, roofs, hedges and pieces of road painted otherwise, and other cars. "street" has none.
+        variant: other than 0, a street that could be taken for the seed's own: of the same shape, with three
+            quarters of its walls, roofs, hedges and pieces of road painted otherwise, and other cars. "street" has
+            none.
         drive_seed: of parked cars, moving cars and the sun.
         parked_cars_changed: share of the parked cars that differ between any two drive seeds.
         moving_cars_per_km: oncoming cars; if any, one more drives ahead (a van 6 m ahead from 60 per km on).
