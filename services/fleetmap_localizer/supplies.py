@@ -13,6 +13,7 @@ from fleetmap_localizer.map_view import MapView
 
 LatLon = tuple[float, float]  # degrees
 OpenSupply = Callable[[Camera, LatLon | None], MapSupply]
+_Key = tuple[Camera, LatLon | None]
 
 _PLACE_DIGITS = 3  # of a degree: who asks from within some 100 m of another shares his maps
 _MAX_SUPPLIES, _MAX_LANDMARKS = 8, 2_000_000
@@ -25,6 +26,7 @@ class _Shelved:
     lock: Lock = field(default_factory=Lock)
     supply: MapSupply | None = None
     landmarks: int = 0
+    is_dropped: bool = False  # who waited for it needs another one
 
 
 class Supplies:
@@ -45,7 +47,7 @@ class Supplies:
         self._open = open_supply
         self._max_supplies, self._max_landmarks = max_supplies, max_landmarks
         self._lock = Lock()  # of the next line; never held while something is fetched
-        self._shelf: OrderedDict[tuple[Camera, LatLon | None], _Shelved] = OrderedDict()
+        self._shelf: OrderedDict[_Key, _Shelved] = OrderedDict()
 
     def views(self, camera: Camera, near_lat_lon_deg: LatLon | None) -> tuple[MapView, ...]:
         """What to look into for an image of a camera.
@@ -54,20 +56,15 @@ class Supplies:
             NoPoseError: there is no map here.
             ServerError: the map server failed, and nothing is at hand.
         """
-        place = None if near_lat_lon_deg is None else _rounded(near_lat_lon_deg)
-        key = camera, place
-        with self._lock:
-            shelved = self._shelf.setdefault(key, _Shelved())
-            self._shelf.move_to_end(key)
-        try:
-            with shelved.lock:
-                if shelved.supply is None:
-                    shelved.supply = self._open(camera, place)
-                views = shelved.supply.views()
-                shelved.landmarks = sum(len(view.content.landmarks) for view in views)
-        except BaseException:
-            self._drop(key, shelved)
-            raise
+        key = camera, None if near_lat_lon_deg is None else _rounded(near_lat_lon_deg)
+        views: tuple[MapView, ...] | None = None
+        while views is None:
+            shelved = self._shelved(key)
+            try:
+                views = self._views_of(shelved, key)
+            except BaseException:
+                self._drop(key, shelved)
+                raise
         self._make_room()
         return views
 
@@ -77,6 +74,23 @@ class Supplies:
             all_of_them = list(self._shelf.items())
         for key, shelved in all_of_them:
             self._drop(key, shelved)
+
+    def _shelved(self, key: _Key) -> _Shelved:
+        with self._lock:
+            shelved = self._shelf.setdefault(key, _Shelved())
+            self._shelf.move_to_end(key)
+            return shelved
+
+    def _views_of(self, shelved: _Shelved, key: _Key) -> tuple[MapView, ...] | None:
+        """None if it was dropped before its turn came."""
+        with shelved.lock:
+            if shelved.is_dropped:
+                return None
+            if shelved.supply is None:
+                shelved.supply = self._open(*key)
+            views = shelved.supply.views()
+            shelved.landmarks = sum(len(view.content.landmarks) for view in views)
+            return views
 
     def _make_room(self) -> None:
         while True:
@@ -88,14 +102,14 @@ class Supplies:
                 key, shelved = next(iter(self._shelf.items()))
             self._drop(key, shelved)
 
-    def _drop(self, key: tuple[Camera, LatLon | None], shelved: _Shelved) -> None:
+    def _drop(self, key: _Key, shelved: _Shelved) -> None:
         with self._lock:
             if self._shelf.get(key) is shelved:
                 del self._shelf[key]
         with shelved.lock:
-            if shelved.supply is not None:
+            if shelved.supply is not None and not shelved.is_dropped:
                 shelved.supply.close()
-            shelved.supply = None  # who waited for it opens another one
+            shelved.is_dropped = True
 
 
 def _rounded(lat_lon_deg: LatLon) -> LatLon:

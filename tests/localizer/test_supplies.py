@@ -98,3 +98,22 @@ def test_many_who_ask_at_once_are_served_by_one(content):
         found = list(pool.map(ask, range(8)))
     assert all(views is found[0] for views in found)
     assert log == ["open 50 (49.0, 8.4)"]
+
+
+def test_whatever_was_opened_is_closed_once_however_many_ask_for_more_than_there_is_room(content):
+    log: list[str] = []
+    supplies, together = supplies_of(log, content, max_supplies=1), Barrier(6)
+
+    def ask(number: int) -> None:
+        together.wait(20.0)
+        for turn in range(10):
+            assert supplies.views(CAMERA, (float((number + turn) % 3), 0.0))
+
+    with ThreadPoolExecutor(6) as pool:
+        list(pool.map(ask, range(6)))
+    supplies.close()
+    opened, closed = (
+        [line.split(" ", 1)[1] for line in log if line.startswith(word)] for word in ("open", "close")
+    )
+    assert len(opened) >= 3
+    assert sorted(opened) == sorted(closed)
