@@ -39,7 +39,7 @@ _Locate = Callable[[bytes, str], Localized]  # an image, and what to call it
 @optional_server_options("Look into the maps of this map server, e.g. tcp/127.0.0.1:7447.")
 @click.option("--map", "map_", type=_PATH, metavar="FOLDER", help="Look into this map package.")
 @click.option(
-    "--near", type=LAT_LON, help="Roughly where: only what was mapped around there is fetched and searched."
+    "--near", type=LAT_LON, help="Where, off by 300 m at most: only what was mapped around there is fetched."
 )
 @click.option("--remote", is_flag=True, help="With --server: have its localizer do it; no map is fetched to here.")
 @click.option(
