@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from fleetmap_cli.benchmarks import (
+    localizer_catalogue,
     localizer_drives,
     localizer_gaps,
     localizer_honesty,
@@ -17,6 +18,7 @@ BENCHMARK = Benchmark(
     "images of one vehicle in the maps of another",
     (
         *localizer_drives.ROWS,
+        *localizer_catalogue.ROWS,
         *localizer_gaps.ROWS,
         *localizer_honesty.ROWS,
         *localizer_size.ROWS,

@@ -80,6 +80,11 @@ class Catalogue:
         """Whether another street of the catalogue could be taken for it."""
         return sum((other.kind, other.world) == (street.kind, street.world) for other in self.streets) > 1
 
+    @property
+    def kilometres(self) -> float:
+        """Of simulated streets."""
+        return sum(min(self.length_m, street.longest_m) for street in self.streets) / 1e3
+
     def make(self, bench: Workbench) -> None:
         """Maps NAME-map, and recordings NAME-query.mcap."""
         write_camera(bench.folder / "catalogue-survey.yaml", _SURVEY_CAMERA, force=True)
@@ -131,11 +136,11 @@ def cold_row(catalogue: Catalogue) -> Row:
             right_maps |= {"second": "survey-map", "odd": "even-map"}
         runs = [_ask(bench, maps, names, every) for names, every in queries]
         answers = [answer for run in runs for answer in run["answers"]]
-        verdicts = [_verdict(bench, answer, right_maps[answer["recording"]]) for answer in answers]
+        verdicts = [verdict_of(bench, answer, right_maps[answer["recording"]]) for answer in answers]
         twins = {f"{street.name}-query" for street in catalogue.streets if catalogue.is_twin(street)}
         is_twin = [answer["recording"] in twins for answer in answers]
         km = (sum(_length_m(bench, name) for name in maps)) / 1e3
-        return _counted(verdicts, is_twin) | {
+        return counted(verdicts, is_twin) | {
             "ms median": rounded(1e3 * float(np.median([answer["duration_s"] for answer in answers])), 1),
             "ms p95": rounded(1e3 * float(np.percentile([answer["duration_s"] for answer in answers], 95)), 1),
             "memory MB": round(max(run["memory_bytes"] for run in runs) / 1e6),
@@ -143,10 +148,8 @@ def cold_row(catalogue: Catalogue) -> Row:
             "landmarks/m": rounded(runs[0]["landmarks"] / km / 1e3, 1),
         }
 
-    kilometres = sum(min(catalogue.length_m, street.longest_m) for street in catalogue.streets) / 1e3
-    about = (
-        f"{len(catalogue.streets)} simulated streets, {kilometres:.1f} km, and both real maps; takes 25 minutes"
-    )
+    streets = f"{len(catalogue.streets)} simulated streets, {catalogue.kilometres:.1f} km"
+    about = f"{streets}, and both real maps; takes 25 minutes"
     needs = (RAW, ODOMETRY) if catalogue.with_real_drives else ()
     return Row("cold-10km", about, measure, needs, COLD, _REACH)
 
@@ -157,7 +160,7 @@ def _ask(bench: Workbench, maps: Sequence[str], queries: Sequence[str], every: i
     return bench.python_module("fleetmap_cli.benchmarks.cold_queries", words).json()
 
 
-def _verdict(bench: Workbench, answer: dict[str, Any], right_map: str) -> str:
+def verdict_of(bench: Workbench, answer: dict[str, Any], right_map: str) -> str:
     """One of "right", "wrong map", "wrong place" and "none"."""
     if "map" not in answer:
         return "none"
@@ -176,7 +179,8 @@ def _true_position_m(bench: Workbench, answer: dict[str, Any], right_map: str) -
     return np.array([np.interp(answer["stamp_ns"], stamps, axis) for axis in truth.positions_m.T])
 
 
-def _counted(verdicts: Sequence[str], is_twin: Sequence[bool]) -> Figures:
+def counted(verdicts: Sequence[str], is_twin: Sequence[bool]) -> Figures:
+    """How many queries of which verdict; of those in streets of a pair, and of the others."""
     right = np.array([verdict == "right" for verdict in verdicts])
     twins = np.array(is_twin)
     return {
