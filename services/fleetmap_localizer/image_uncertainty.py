@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.camera import Camera
+from fleetmap.vision.absolute_pose import CHI2_95_2DOF
 from fleetmap.visual_map import Landmarks
 from fleetmap_localizer.gate import Fit
 
@@ -45,6 +46,11 @@ class _Linearised:
     J: Array  # (N, 2, 6) by the tangent [rotation (rad), translation (m)] in the camera's frame
     L: Array  # (N, 2, 2) covariance that the landmark's own error has in the image
 
+    def kept_covariance(self) -> Array:
+        """What of L (N, 2, 2) shows in the residuals of inliers, among which there are no large ones."""
+        x = CHI2_95_2DOF / np.clip(np.einsum("naa->n", self.L), 0.1, None)
+        return np.asarray(self.L * (1.0 - x / np.expm1(x))[:, None, None])
+
 
 @dataclass(frozen=True)
 class _CellSums:
@@ -55,6 +61,8 @@ class _CellSums:
     ZZ: Array  # (2 C,) the diagonal of Z'Z
     ZLZ: Array  # (2 C, 2 C) Z'L Z
     ZLX: Array  # (2 C, 6) Z'L X
+    XLX: Array  # (6, 6) X'L X
+    own: float  # tr L
 
 
 def relative_covariance(fit: Fit, landmarks: Landmarks, camera: Camera) -> Array:
@@ -63,36 +71,34 @@ def relative_covariance(fit: Fit, landmarks: Landmarks, camera: Camera) -> Array
     X = seen.J.reshape(-1, 6)
     A = X.T @ X
     A_inverse = np.asarray(np.linalg.inv(A), dtype=np.float64)
-    XLX = np.asarray(np.einsum("nai,nab,nbj->ij", seen.J, seen.L, seen.J), dtype=np.float64)
     sums, K = _sum_in_cells(seen), _correlations(camera)
-    white, common = _variance_components(seen, sums, K, A_inverse, XLX)
-    meat = white * A + common * sums.G.T @ K @ sums.G + XLX
+    white, common = _variance_components(seen, sums, K, A_inverse)
+    meat = white * A + common * sums.G.T @ K @ sums.G + np.einsum("nai,nab,nbj->ij", seen.J, seen.L, seen.J)
     covariance = A_inverse @ meat @ A_inverse
     return np.asarray((covariance + covariance.T) / 2.0)
 
 
-def _variance_components(
-    seen: _Linearised, sums: _CellSums, K: Array, A_inverse: Array, XLX: Array
-) -> tuple[float, float]:
+def _variance_components(seen: _Linearised, sums: _CellSums, K: Array, A_inverse: Array) -> tuple[float, float]:
     """(s_w, s_c): with M = I - X A^-1 X', residuals have E[r'M Q M r] = tr(M Q M V); Q = I first, then Z K Z'."""
     P = A_inverse @ sums.G.T
     ZMZ = np.diag(sums.ZZ) - sums.G @ P
     cross = sums.ZLX @ P
-    ZMLMZ = sums.ZLZ - cross - cross.T + P.T @ XLX @ P
+    ZMLMZ = sums.ZLZ - cross - cross.T + P.T @ sums.XLX @ P
     KZMZ = K @ ZMZ
     by_white, by_common = np.trace(KZMZ), float(np.einsum("ij,ji->", KZMZ, KZMZ))
     freedom = 2.0 * len(seen.residuals) - 6.0
-    own = float(np.einsum("naa->", seen.L) - np.einsum("ij,ji->", A_inverse, XLX))
+    own = sums.own - float(np.einsum("ij,ji->", A_inverse, sums.XLX))
     squares = float((seen.residuals**2).sum()) - own
     correlated = float(sums.residuals @ K @ sums.residuals) - float(np.einsum("ij,ji->", K, ZMLMZ))
     T = np.array([[freedom, by_white], [by_white, by_common]])
     white, common = np.linalg.solve(T, [squares, correlated]).tolist()
-    if common < 0.0:
-        white = squares / freedom
     if white < _LEAST_WHITE:
         white, common = _LEAST_WHITE, (correlated - by_white * _LEAST_WHITE) / by_common
-    doubt = white * float(np.sqrt(2.0 * np.linalg.inv(T)[1, 1]))  # cov(q) = 2 s_w^2 T where s_c is small
-    return white, max(common, 0.0) + doubt
+    if common < 0.0:
+        white = max(squares / freedom, _LEAST_WHITE)
+    spread = white * KZMZ + max(common, 0.0) * KZMZ @ KZMZ  # var(q) = 2 tr(spread^2) of the second quadratic form
+    doubt = np.linalg.inv(T)[1, 1] * np.sqrt(2.0 * np.einsum("ij,ji->", spread, spread))
+    return white, max(common + float(doubt), 0.0)
 
 
 def _linearise(fit: Fit, landmarks: Landmarks, camera: Camera) -> _Linearised:
@@ -122,15 +128,18 @@ def _sum_in_cells(seen: _Linearised) -> _CellSums:
     count, cells = len(seen.weights), _COLUMNS * _ROWS
     Z = np.zeros((cells, count))
     Z[seen.cells, np.arange(count)] = seen.weights
-    LJ = seen.L @ seen.J
+    L = seen.kept_covariance()
+    LJ = L @ seen.J
     ZLZ = np.zeros((cells, 2, cells, 2))
-    ZLZ[np.arange(cells), :, np.arange(cells), :] = ((Z * Z) @ seen.L.reshape(count, 4)).reshape(cells, 2, 2)
+    ZLZ[np.arange(cells), :, np.arange(cells), :] = ((Z * Z) @ L.reshape(count, 4)).reshape(cells, 2, 2)
     return _CellSums(
         (Z @ seen.J.reshape(count, 12)).reshape(-1, 6),
         (Z @ seen.residuals).reshape(-1),
         np.repeat((Z * Z).sum(axis=1), 2),
         ZLZ.reshape(2 * cells, 2 * cells),
         (Z @ LJ.reshape(count, 12)).reshape(-1, 6),
+        np.einsum("nai,naj->ij", seen.J, LJ),
+        float(np.einsum("naa->", L)),
     )
 
 
