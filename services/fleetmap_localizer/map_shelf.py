@@ -98,12 +98,14 @@ class Shelf:
         if found is None and self._disk is not None:
             found = self._disk.get(sha256, size_bytes)
             if found is not None:
-                self._parts[sha256] = found
+                with self._lock:
+                    self._parts[sha256] = found
         return found
 
     def put_part(self, sha256: str, data: bytes) -> None:
         """A part that was fetched."""
-        self._parts[sha256] = data
+        with self._lock:
+            self._parts[sha256] = data
         if self._disk is not None:
             self._disk.keep(sha256, data)
 

@@ -92,6 +92,7 @@ class Whereabouts:
     settings: WindowSettings
     fixed: _Fixed | None = None  # None: it may be anywhere
     now_ns: int | None = None
+    measured_ns: int | None = None  # of the last image that showed the place, or of the first that did not
     in_a_row: int = 0  # measured poses
 
     @staticmethod
@@ -113,10 +114,12 @@ class Whereabouts:
         fixed = self.fixed
         if fixed is not None and fixed.stamp_ns is None:
             fixed = replace(fixed, stamp_ns=answer.stamp_ns)
-        now = replace(self, fixed=fixed, now_ns=answer.stamp_ns)
+        is_measured = isinstance(answer, PoseEstimate) and answer.kind == "measured"
+        measured_ns = answer.stamp_ns if is_measured or self.measured_ns is None else self.measured_ns
+        now = replace(self, fixed=fixed, now_ns=answer.stamp_ns, measured_ns=measured_ns)
         if isinstance(answer, NoPose):
             return replace(now, in_a_row=0)
-        now = replace(now, in_a_row=self.in_a_row + (answer.kind == "measured"))
+        now = replace(now, in_a_row=self.in_a_row + is_measured)
         if now.in_a_row >= self.settings.sure_after or not now.is_searching:
             return replace(now, fixed=_fixed_by(answer, fixed))
         return now
@@ -124,12 +127,12 @@ class Whereabouts:
     @property
     def is_searching(self) -> bool:
         """Whether there is no recent pose to go on from."""
-        return self.fixed is None or not self.fixed.is_pose or self.is_lost
+        return self.fixed is None or not self.fixed.is_pose or self._unknown_s > 0.0
 
     @property
     def is_lost(self) -> bool:
-        """Whether there has been no pose for long, though there is a place to search around."""
-        return self._lost_s > 0.0
+        """Whether images have not shown for long where it is, though other sensors may tell."""
+        return self.fixed is not None and self._later_s(self.measured_ns) > 0.0
 
     def look_area(self) -> Area | None:
         """What is to be ready; None for everything."""
@@ -146,6 +149,8 @@ class Whereabouts:
         mine, theirs = self.fetch_area(), other.fetch_area()
         if mine is None or theirs is None or mine.epsg != theirs.epsg or self.is_searching != other.is_searching:
             return False
+        if self.is_lost != other.is_lost:
+            return False
         step_m = 0.1 * self.settings.look_m
         return bool(
             np.linalg.norm(mine.centres_m[0] - theirs.centres_m[0]) <= step_m
@@ -154,16 +159,20 @@ class Whereabouts:
         )
 
     @property
-    def _lost_s(self) -> float:
-        """How much longer than ``lost_s`` there has been no pose."""
-        if self.fixed is None or self.fixed.stamp_ns is None or self.now_ns is None:
+    def _unknown_s(self) -> float:
+        """How much longer than ``lost_s`` there has been no pose of any kind."""
+        return 0.0 if self.fixed is None else self._later_s(self.fixed.stamp_ns)
+
+    def _later_s(self, stamp_ns: int | None) -> float:
+        """How much longer ago than ``lost_s`` something was."""
+        if stamp_ns is None or self.now_ns is None:
             return 0.0
-        return max(abs(self.now_ns - self.fixed.stamp_ns) * 1e-9 - self.settings.lost_s, 0.0)
+        return max(abs(self.now_ns - stamp_ns) * 1e-9 - self.settings.lost_s, 0.0)
 
     def _area(self, reach_m: float, ahead_s: float) -> Area | None:
         if self.fixed is None:
             return None
-        growth_m = min(self.settings.growth_mps * self._lost_s, self.settings.max_growth_m)
+        growth_m = min(self.settings.growth_mps * self._unknown_s, self.settings.max_growth_m)
         way_m = ahead_s * float(np.linalg.norm(self.fixed.velocity_mps))
         times_s = np.linspace(0.0, ahead_s, 2 + int(way_m / reach_m)) if way_m > 0.0 else np.zeros(1)
         centres_m = self.fixed.position_m + times_s[:, None] * self.fixed.velocity_mps

@@ -134,6 +134,10 @@ def test_a_predicted_pose_is_followed_with_its_uncertainty_but_vouches_for_nothi
     assert area is not None
     assert area.radius_m == pytest.approx(150.0 + 90.0, abs=0.1)
     assert area.centres_m[0, 0] == EAST_M + 20.0
+    for at_s in (3.0, 4.0, 5.0):
+        followed = followed.after(pose(at_s, 10.0 * at_s, kind="predicted"))
+    assert followed.is_lost  # images say nothing: other maps may show more
+    assert not followed.is_searching
     nowhere = Whereabouts(SETTINGS)
     for number in range(9):
         nowhere = nowhere.after(pose(0.1 * number, 0.0, kind="predicted"))

@@ -341,6 +341,19 @@ def test_where_maps_overlap_the_newest_is_looked_into_alone_and_the_next_where_i
         assert [view.map_id for view in drive(supply, 620.0, 1200.0)] == ["east"]
 
 
+def test_what_covers_the_place_best_is_not_all_there_is_for_a_vehicle_that_is_lost(
+    site, road: Path, tmp_path: Path
+) -> None:
+    site.publish(road)
+    site.publish(write_road(tmp_path / "winter", "winter", day=90, seed=9))
+    near, cache = lat_lon(300.0), tmp_path / "cache"
+    with closing(map_supply_of(site.origin(), CAMERA, near_lat_lon_deg=near, cache=cache, in_step=True)) as supply:
+        assert [view.map_id for view in drive(supply, 300.0, 330.0)] == ["winter"]
+        supply.moved(NoPose(40 * 10**9, "summer"))
+        assert {view.map_id for view in supply.views()} == {"road", "winter"}
+        assert len(drive(supply, 400.0, 420.0)) == 1
+
+
 def test_more_maps_than_can_be_searched_are_the_newest_and_one_warning(
     site, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
