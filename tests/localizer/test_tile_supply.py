@@ -29,7 +29,7 @@ from fleetmap_localizer.tile_supply import TileSupply, map_supply_of
 CAMERA = Camera(640, 400, 430.0, 430.0, 319.5, 199.5)
 ANCHOR = UtmAnchor(32632, 691_200, 5_334_784, 500)  # the south-west corner of a cell
 CELL_M, SPACING_M = 128.0, 8.0
-PATIENCE_S = 8.0  # of the tests, with what other threads do
+PATIENCE_S = 30.0  # of the tests, with what other threads do
 
 
 def write_road(
