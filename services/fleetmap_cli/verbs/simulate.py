@@ -67,7 +67,7 @@ class _SensorList(click.ParamType[frozenset[str]]):
     type=_SEED,
     metavar="N",
     help="Other than 0: a street that could be taken for the world's own. Of the same shape, three quarters of "
-    "its walls, roofs, hedges and pieces of road painted otherwise, and other cars.",
+    "its walls, roofs, hedges and pieces of road painted otherwise, other trees, cars and hills.",
 )
 @click.option(
     "--site",

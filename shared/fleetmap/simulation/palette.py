@@ -82,7 +82,7 @@ class Palette:
     """A pool of textures, the same for the same seed whatever order they are asked for in.
 
     ``richness`` is how many of each kind there are, as a factor. In a ``variant`` other than 0, three
-    quarters of all that is picked are painted otherwise; which, its number says.
+    quarters of all that is picked are painted otherwise; which, its number says. Trees have other crowns.
     """
 
     def __init__(self, seed: int, builder: SurfaceBuilder, richness: float = 1.0, variant: int = 0) -> None:
@@ -147,7 +147,8 @@ class Palette:
 
     def crowns(self) -> list[int]:
         """Leafy outlines of trees."""
-        return [self._crown(number) for number in range(max(round(8 * self._richness), 3))]
+        count = max(round(8 * self._richness), 3)
+        return [self._crown(count * self._variant + number) for number in range(count)]
 
     def bark(self) -> int:
         """Trunks."""

@@ -120,8 +120,8 @@ def build_world(
             bend, no traffic.
         length_m: of the path; of one lap on a circuit.
         variant: other than 0, a street that could be taken for the seed's own: of the same shape, with three
-            quarters of its walls, roofs, hedges and pieces of road painted otherwise, and other cars. "street" has
-            none.
+            quarters of its walls, roofs, hedges and pieces of road painted otherwise, other crowns on its trees,
+            other cars and other hills around. "street" has none.
         drive_seed: of parked cars, moving cars and the sun.
         parked_cars_changed: share of the parked cars that differ between any two drive seeds.
         moving_cars_per_km: oncoming cars; if any, one more drives ahead (a van 6 m ahead from 60 per km on).
@@ -143,6 +143,8 @@ def build_world(
     _require_sense(length_m, parked_cars_changed, moving_cars_per_km)
     anchor = anchor_at(lat_deg, lon_deg, height_m)
     plan_rng, far_rng = np.random.default_rng(seed).spawn(2)
+    if variant:
+        far_rng = np.random.default_rng([seed, variant])
     drive_rng = np.random.default_rng([seed, drive_seed])
     builder = SurfaceBuilder(_towards_sun(drive_rng, sun_deg))
     palette = Palette(seed, builder, variant=variant)
