@@ -49,6 +49,7 @@ class SensedDrive:
     imu: str | None = "consumer"
     has_wheels: bool = True
     gnss: GnssErrorModel | None = None
+    outlier_ratio: float = 0.0
     imu_pause_s: tuple[float, float] = (-1.0, -1.0)
     wheel_mounting_source: str = STATIC
 
@@ -84,7 +85,7 @@ class SensedDrive:
         assert self.gnss is not None, "GNSS is read only where it may be used"
         truth = self.motion.trajectory(self.motion.stamps_ns(5.0, 0.037))
         antennas_m = truth.positions_m + truth.rotations @ MOUNTING.cam_from_antenna.translation_m
-        return fixes_at(UtmGrid(truth.epsg), truth.stamps_ns, antennas_m, self.gnss, self.seed)
+        return fixes_at(UtmGrid(truth.epsg), truth.stamps_ns, antennas_m, self.gnss, self.seed, self.outlier_ratio)
 
     def antenna(self) -> Antenna:
         return Antenna(MOUNTING.cam_from_antenna.translation_m, STATIC)
@@ -164,8 +165,8 @@ def drive_over(
     reckoning = DeadReckoning.for_drive(drive, use_gnss=use_gnss, settings=settings)  # type: ignore[arg-type]
     assert reckoning is not None
     truth, predicted = drive.truth, []
-    for index, pose in enumerate(measured_poses(truth, drive.seed)):
-        if gap_s[0] <= index / RATE_HZ < gap_s[1]:
+    for index, pose in enumerate(measured_poses(truth, drive.seed)[: round(gap_s[1] * RATE_HZ)]):
+        if index / RATE_HZ >= gap_s[0]:
             found = reckoning.pose_at(pose.stamp_ns)
             if found is not None:
                 assert found.kind == "predicted"
@@ -240,6 +241,15 @@ def test_fixes_shrink_what_an_imu_alone_would_lose(motion: Motion) -> None:
     assert aided.end_sigma_m < 0.7 * alone.end_sigma_m
     assert aided.end_error_m < 3.0 * aided.end_sigma_m
     assert 0.5 < aided.nees.mean() < 12.0
+
+
+def test_fixes_that_are_far_off_are_not_believed(motion: Motion) -> None:
+    """A fifth of them is 5 to 50 m off and does not know it."""
+    drive = SensedDrive(motion, has_wheels=False, gnss=CONSUMER, outlier_ratio=0.2)
+    gap = drive_over(drive, (8.0, 18.0), use_gnss=True)
+    assert None not in gap.predicted
+    assert 0.02 < gap.end_error_m < 2.5
+    assert 0.5 < gap.nees.mean() < 12.0
 
 
 def test_with_nothing_to_reckon_with_there_is_no_reckoning(motion: Motion) -> None:
