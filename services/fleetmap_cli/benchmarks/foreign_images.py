@@ -43,8 +43,8 @@ class ForeignQuery:
 
 def real_queries(package: Path, recording: Path) -> Iterator[ForeignQuery]:
     """Every image of a recording, in the map of another street; and all of them spoilt."""
-    source, drive, settings = read_map(package), open_drive(recording), LocalizerSettings()
-    localizer = Localizer(drive.camera, (MapView(source, drive.camera, settings),), settings)
+    drive = open_drive(recording)
+    localizer = _localizer(read_map(package), drive.camera)
     for number, frame in enumerate(drive.frames()):
         yield ForeignQuery(OTHER, _is_posed_alone(localizer, frame))
         kind = list(SPOILERS)[number % len(SPOILERS)]
@@ -62,15 +62,13 @@ def simulated_queries(streets: int = 2 * len(STREETS)) -> Iterator[ForeignQuery]
         ]
         if draw.has_twin:
             asked += [(TWIN, frame) for frame in _images(replace(draw, variant=1))]
-        yield from _alone_and_after(draw.mapped(), draw.query().camera, images[draw], asked)
+        yield from alone_and_after(_localizer(draw.mapped(), draw.query().camera), images[draw], asked)
 
 
-def _alone_and_after(
-    source: LocalizableMap, camera: Camera, good: Sequence[Frame], asked: Sequence[tuple[str, Frame]]
+def alone_and_after(
+    localizer: Localizer, good: Sequence[Frame], asked: Sequence[tuple[str, Frame]]
 ) -> Iterator[ForeignQuery]:
     """Each image on its own, and as the next of a track through good images, where those can be followed."""
-    settings = LocalizerSettings()
-    localizer = Localizer(camera, (MapView(source, camera, settings),), settings)
     for number, (kind, frame) in enumerate(asked):
         yield ForeignQuery(kind, _is_posed_alone(localizer, frame))
         first = number % (len(good) - 1)
@@ -78,6 +76,11 @@ def _alone_and_after(
         if all(isinstance(localizer.localize(each), PoseEstimate) for each in good[first : first + 2]):
             following = replace(frame, stamp_ns=good[first + 1].stamp_ns + _STEP_NS)
             yield ForeignQuery(kind, isinstance(localizer.localize(following), PoseEstimate))
+
+
+def _localizer(source: LocalizableMap, camera: Camera) -> Localizer:
+    settings = LocalizerSettings()
+    return Localizer(camera, (MapView(source, camera, settings),), settings)
 
 
 def _is_posed_alone(localizer: Localizer, frame: Frame) -> bool:
@@ -99,7 +102,7 @@ def _spoilt(frame: Frame, kind: str, seed: int) -> Frame:
 
 def noise(image: Image, rng: np.random.Generator) -> Image:
     """Nothing but noise."""
-    return rng.integers(0, 256, image.shape, dtype=np.uint8)
+    return np.asarray(rng.integers(0, 256, image.shape), dtype=np.uint8)
 
 
 def black(image: Image, rng: np.random.Generator) -> Image:

@@ -31,7 +31,7 @@ Array = NDArray[np.float64]
 HONESTY = Group(
     "Honesty",
     "*nees*: independent draws of world, day, receiver noise, survey (45 m, RTK every second, 640x240) and second "
-    "vehicle (other camera, height, light, lane; every image on its own, one pose a draw). NEES is the error in UTM "
+    "vehicle (other camera, height, light, lane; images on their own, one pose a draw). NEES is the error in UTM "
     "normalised by the pose's own covariance; its mean should be 6, and 3 for positions. *foreign*: images of "
     "other streets, of rows of houses that look alike, and of nothing, with the settings of all other rows; on "
     "their own, and after images that a track goes on from. Not counted among them is the mapped street's twin: a "
