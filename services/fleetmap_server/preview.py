@@ -39,7 +39,8 @@ def preview_ply(manifest: Manifest, read_part: Callable[[PartRecord], bytes]) ->
 def preview_points(manifest: Manifest, read_part: Callable[[PartRecord], bytes]) -> NDArray[np.float64]:
     """Landmarks in UTM, (N, 3) float64, evenly out of all of them. Raises MapPackageError."""
     anchor = manifest.anchor.to_anchor()
-    every = -(-manifest.quality.landmarks // MAX_PREVIEW_POINTS) or 1
+    landmarks = manifest.quality.landmarks if manifest.localizable is None else manifest.localizable.landmarks
+    every = -(-landmarks // MAX_PREVIEW_POINTS) or 1
     chosen: dict[int, NDArray[np.float64]] = {}
     for record in manifest.parts:
         if record.kind != "cell" or len(chosen) >= MAX_PREVIEW_POINTS:
