@@ -112,14 +112,16 @@ def black(image: Image, rng: np.random.Generator) -> Image:
 
 def blurred(image: Image, rng: np.random.Generator) -> Image:
     """Far out of focus, by a thirtieth of the width, with the sensor's noise."""
-    smooth = np.asarray(cv2.GaussianBlur(image.astype(np.float32), (0, 0), image.shape[1] / 30.0))
+    sharp = image.astype(np.float32)
+    smooth = np.asarray(cv2.GaussianBlur(sharp, (0, 0), image.shape[1] / 30.0), dtype=np.float32)
     return np.clip(smooth + rng.normal(0.0, 1.5, image.shape), 0, 255).astype(np.uint8)
 
 
 def covered(image: Image, rng: np.random.Generator) -> Image:
     """A lens under blotches of dirt, but for a twentieth of the view."""
     height, width = image.shape
-    dirt = np.asarray(cv2.GaussianBlur(rng.normal(0.0, 1.0, image.shape), (0, 0), width / 60.0))
+    spots = rng.normal(0.0, 1.0, image.shape)
+    dirt = np.asarray(cv2.GaussianBlur(spots, (0, 0), width / 60.0), dtype=np.float64)
     result = np.clip(40.0 + 20.0 * dirt / dirt.std(), 0, 255).astype(np.uint8)
     window = slice(height // 2, height // 2 + height // 5), slice(width // 8, width // 8 + width // 4)
     result[window] = image[window]
