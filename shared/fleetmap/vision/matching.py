@@ -125,37 +125,6 @@ def bit_count(x):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def nearest_words(words_a, words_b, count):  # type: ignore[no-untyped-def]
-    """The closest of ``words_b`` (M, 4) to each of ``words_a`` (N, 4), closest first: indices (N, count) int32.
-
-    Where b has fewer than ``count``, the last one again.
-    """
-    nearest = np.empty((len(words_a), count), np.int32)
-    columns, to_all = words_b.T.copy(), np.empty(len(words_b), np.int32)
-    distances = np.empty(count, np.int64)
-    for i in range(len(words_a)):
-        hamming_to_all(words_a[i], columns, to_all)
-        distances[:] = _NO_PAIR
-        found = 0
-        for first in range(0, len(to_all), _BLOCK):
-            if _smallest(to_all[first : first + _BLOCK]) >= distances[count - 1]:  # as in most blocks
-                continue
-            for j in range(first, min(first + _BLOCK, len(to_all))):
-                distance = to_all[j]
-                if distance >= distances[count - 1]:
-                    continue
-                slot = min(found, count - 1)
-                while slot > 0 and distances[slot - 1] > distance:
-                    distances[slot], nearest[i, slot] = distances[slot - 1], nearest[i, slot - 1]
-                    slot -= 1
-                distances[slot], nearest[i, slot] = distance, j
-                found = min(found + 1, count)
-        for slot in range(found, count):
-            nearest[i, slot] = nearest[i, found - 1]
-    return nearest
-
-
-@njit(cache=True, nogil=True)
 def _smallest(values):  # type: ignore[no-untyped-def]
     smallest = values[0]
     for n in range(len(values)):  # over the values themselves LLVM would go one by one

@@ -11,7 +11,6 @@ from fleetmap.vision.matching import (
     match_by_projection,
     match_descriptors,
     medoid_descriptor,
-    nearest_words,
 )
 
 K = np.array([[500.0, 0.0, 320.0], [0.0, 500.0, 200.0], [0.0, 0.0, 1.0]])
@@ -162,19 +161,3 @@ def test_the_medoid_is_the_descriptor_in_the_middle() -> None:
     track = np.concatenate([around[:3], middle, around[3:]])
     assert medoid_descriptor(track) == 3
     assert medoid_descriptor(middle) == 0
-
-
-def test_the_nearest_words_are_those_of_an_exhaustive_search() -> None:
-    a, b = random_descriptors(50), random_descriptors(200, seed=3)
-    bits = np.array([[np.bitwise_count(x ^ y).sum() for y in b] for x in a])
-    nearest = nearest_words(as_words(a), as_words(b), 3)
-    assert nearest.shape == (50, 3)
-    assert np.array_equal(np.take_along_axis(bits, nearest, axis=1), np.sort(bits, axis=1)[:, :3])
-    assert all(len(set(row)) == 3 for row in nearest.tolist())
-
-
-def test_a_vocabulary_smaller_than_asked_repeats_its_last_word() -> None:
-    a, b = random_descriptors(4), random_descriptors(2, seed=3)
-    nearest = nearest_words(as_words(a), as_words(b), 3)
-    assert np.array_equal(nearest[:, 1], nearest[:, 2])
-    assert np.all(nearest[:, 0] + nearest[:, 1] == 1)
