@@ -122,7 +122,7 @@ def covered(image: Image, rng: np.random.Generator) -> Image:
     height, width = image.shape
     spots = rng.normal(0.0, 1.0, image.shape)
     dirt = np.asarray(cv2.GaussianBlur(spots, (0, 0), width / 60.0), dtype=np.float64)
-    result = np.clip(40.0 + 20.0 * dirt / dirt.std(), 0, 255).astype(np.uint8)
+    result: Image = np.clip(40.0 + 20.0 * dirt / float(dirt.std()), 0, 255).astype(np.uint8)
     window = slice(height // 2, height // 2 + height // 5), slice(width // 8, width // 8 + width // 4)
     result[window] = image[window]
     return result
