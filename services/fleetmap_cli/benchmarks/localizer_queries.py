@@ -88,7 +88,7 @@ def _figures(bench: Workbench, queries: Queries, errors: TrajectoryErrors, run: 
     figures: Figures = {
         "success": f"{found} of {images}",
         "success %": round(100.0 * found / images, 1),
-        **{f"{name} m": rounded(getattr(errors.position_m, name)) for name in ("median", "p95", "max")},
+        **{f"{name} m": rounded(getattr(errors.position_m, name), 4) for name in ("median", "p95", "max")},
         **rotation_figures(errors.to_json()),
         "wrong": int(wrong.sum()),
         "unsaid": int(unsaid.sum()),

@@ -151,9 +151,11 @@ def _draw(bench: Workbench, points: list[_Point], name: str, all_eyes: tuple[str
     below.set_ylabel("median error (m)")
     below.set_xlabel("cells (MB/km)")
     below.set_xscale("log")
+    below.set_xticks(sizes, [f"{size:.2g}" for size in sizes])
+    below.minorticks_off()
     below.set_ylim(bottom=0.0)
     for axes in (above, below):
-        axes.grid(alpha=0.3, which="both")
+        axes.grid(alpha=0.3)
         axes.legend()
     save_figure(figure, bench.picture(name))
 
