@@ -179,3 +179,14 @@ def test_interpolation_turns_evenly_and_moves_straight(first, turn, shift, fract
     between = interpolate_pose(first, second, fraction)
     assert np.allclose(between.rotation, first.rotation @ so3_exp(fraction * turn), atol=1e-6)
     assert np.allclose(between.translation_m, first.translation_m + fraction * shift, atol=1e-6)
+
+
+def test_the_adjoint_carries_a_small_motion_to_the_other_side_of_a_pose() -> None:
+    pose = Pose(so3_exp(np.array([0.4, -1.1, 0.3])), np.array([3.0, -2.0, 7.0]))
+    xi = 1e-6 * np.array([1.0, -2.0, 0.5, 3.0, 1.0, -2.0])
+    carried = pose.adjoint() @ xi
+    before = pose @ Pose(so3_exp(xi[:3]), xi[3:])
+    after = Pose(so3_exp(carried[:3]), carried[3:]) @ pose
+    np.testing.assert_allclose(before.rotation, after.rotation, atol=1e-11)
+    np.testing.assert_allclose(before.translation_m, after.translation_m, atol=1e-10)
+    assert np.abs(carried - xi).max() > 1e-6  # it is not the identity
