@@ -33,7 +33,7 @@ GAPS = Group(
 )
 _EVERY_S = {2.0: 6.0, 5.0: 9.0, 10.0: 13.0}  # from gap to gap: the camera has time to find itself again
 _VELOCITY_IMAGES = 5  # before a gap
-_REACH = "mean NEES <= 12, about 6 where there are many gaps; no pose measured in the dark"
+_REACH = "mean NEES in [3, 12]; no pose measured in the dark"
 
 
 @dataclass(frozen=True)
