@@ -82,7 +82,8 @@ def relative_to_truth(bench: Workbench, queries: Queries) -> Figures:
 
 
 def _figures(bench: Workbench, queries: Queries, errors: TrajectoryErrors, run: Run) -> Figures:
-    images = queries.images(bench)
+    posed = len(queries.covariances(bench.folder).stamps_ns)
+    images = queries.images(bench) - (posed - errors.matched)  # poses beyond the survey's ends nobody can judge
     wrong, unsaid = wrong_poses(errors, queries.covariances(bench.folder))
     found = errors.matched - int(wrong.sum())
     figures: Figures = {
