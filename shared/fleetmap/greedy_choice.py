@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Ids = NDArray[np.int64]
 
+_WEIGHT_OF_POSE = 2.0  # against that of a well-filled image
 _PRIOR_RAD, _PRIOR_M = 0.1, 1.0  # what a keyframe's pose is known to before any landmark is chosen
 
 
@@ -79,7 +80,7 @@ def _choose(landmarks, views, state):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _gain(i, landmarks, views, state):  # type: ignore[no-untyped-def]
-    """What landmark i would add: half of log det(I + p J P J^T), and p / (1 + n) of a part of the image."""
+    """What landmark i would add: twice log det(I + p J P J^T), and p / (1 + n) of a part of the image."""
     chances, costs = landmarks
     p = chances[i]
     starts, keyframes, parts, jacobians = views
@@ -96,7 +97,7 @@ def _gain(i, landmarks, views, state):  # type: ignore[no-untyped-def]
             a += p * jacobians[m, 0, row] * u
             b += p * jacobians[m, 0, row] * v
             c += p * jacobians[m, 1, row] * v
-        total += 0.5 * np.log(a * c - b * b) + p / (1.0 + counts[parts[m]])
+        total += _WEIGHT_OF_POSE * np.log(a * c - b * b) + p / (1.0 + counts[parts[m]])
     return total / costs[i]
 
 
