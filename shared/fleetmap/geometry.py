@@ -6,6 +6,8 @@ Transforms are named ``target_from_source`` and chain by matching inner names:
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +20,8 @@ Array = NDArray[np.float64]
 # A level camera that looks forward: body x forward, y left, z up; cam x right, y down, z forward.
 CAM_FROM_BODY = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 
-_SMALL_RAD = 1e-3  # below it, two terms of the series are exact to rounding
+_SMALL_RAD = 1e-3  # up to it, three terms of the series are exact to rounding
+_SLACK = 1e-12 + 1e-5 * np.eye(3)  # how far R R^T may be off the identity and still be taken as it is
 
 
 @dataclass(frozen=True)
@@ -119,20 +122,23 @@ def nearest_rotations(matrices: Array) -> Array:
 def so3_exp(rotation_vectors_rad: Array) -> Array:
     """Rotation matrices (..., 3, 3) of rotation vectors (..., 3)."""
     vectors = np.asarray(rotation_vectors_rad, dtype=np.float64)
-    angles = np.sqrt((vectors * vectors).sum(axis=-1, keepdims=True))
-    is_small = angles < _SMALL_RAD
-    per_rad = np.where(is_small, 0.5 - angles**2 / 48.0, np.sin(angles / 2.0) / np.where(is_small, 1.0, angles))
-    return rotations_from_quat_xyzw(np.concatenate([per_rad * vectors, np.cos(angles / 2.0)], axis=-1))
+    angles = _length(vectors)
+    squares, is_small = angles * angles, angles <= _SMALL_RAD
+    series = 0.5 - squares / 48.0 + squares * squares / 3840.0
+    per_rad = np.where(is_small, series, _each(math.sin, angles / 2.0) / np.where(is_small, 1.0, angles))
+    return _rotations_from_unit(
+        np.concatenate([per_rad[..., None] * vectors, _each(math.cos, angles / 2.0)[..., None]], axis=-1)
+    )
 
 
 def so3_log(rotations: Array) -> Array:
     """Rotation vectors (..., 3) in rad of rotation matrices (..., 3, 3)."""
-    quat_xyzw = quat_xyzw_from_rotations(rotations)
-    sines = np.sqrt((quat_xyzw[..., :3] ** 2).sum(axis=-1, keepdims=True))
-    is_small = sines < _SMALL_RAD
-    angles = 2.0 * np.arctan2(sines, quat_xyzw[..., 3:])
-    rad_per = np.where(is_small, 2.0 + sines**2 / 3.0, angles / np.where(is_small, 1.0, sines))
-    return np.asarray(rad_per * quat_xyzw[..., :3])
+    quat = quat_xyzw_from_rotations(rotations)
+    angles = 2.0 * _each(math.atan2, _length(quat[..., :3]), quat[..., 3])
+    squares, is_small = angles * angles, angles <= _SMALL_RAD
+    series = 2.0 + squares / 12.0 + 7.0 * squares * squares / 2880.0
+    rad_per = np.where(is_small, series, angles / np.where(is_small, 1.0, _each(math.sin, angles / 2.0)))
+    return np.asarray(rad_per[..., None] * quat[..., :3])
 
 
 def rotation_angle_rad(rotations: Array) -> Array:
@@ -147,12 +153,10 @@ def rotations_from_quat_xyzw(quat_xyzw: Array) -> Array:
         InputError: one has no length.
     """
     quat = np.asarray(quat_xyzw, dtype=np.float64)
-    lengths = np.sqrt((quat * quat).sum(axis=-1, keepdims=True))
+    lengths = _length(quat)
     if not np.all(lengths > 0.0):
         raise InputError("a quaternion of length zero turns nothing anywhere")
-    quat = quat / lengths
-    products = (quat[..., :, None] * quat[..., None, :]).reshape(*quat.shape[:-1], 16)
-    return np.asarray((products @ _QUATERNION_PRODUCTS.T).reshape(*quat.shape[:-1], 3, 3))
+    return _rotations_from_unit(quat / lengths[..., None])
 
 
 def quat_xyzw_from_rotations(rotations: Array) -> Array:
@@ -162,10 +166,23 @@ def quat_xyzw_from_rotations(rotations: Array) -> Array:
     Source: S. W. Shepperd, "Quaternion from rotation matrix", J. Guidance and Control 1(3), 1978.
     """
     R = np.asarray(rotations, dtype=np.float64)
-    products = np.eye(4) + (R.reshape(*R.shape[:-2], 9) @ _QUATERNION_PRODUCTS).reshape(*R.shape[:-2], 4, 4)
-    largest = np.argmax(np.diagonal(products, axis1=-2, axis2=-1), axis=-1)
-    quat = np.take_along_axis(products, largest[..., None, None], axis=-2)[..., 0, :]
-    quat = quat / np.sqrt((quat * quat).sum(axis=-1, keepdims=True))
+    is_off = np.any(np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)) > _SLACK, axis=(-2, -1))
+    if np.any(is_off):
+        R = np.where(is_off[..., None, None], nearest_rotations(R), R)
+    xx, yy, zz = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
+    xy, xz, yz = R[..., 1, 0] + R[..., 0, 1], R[..., 0, 2] + R[..., 2, 0], R[..., 2, 1] + R[..., 1, 2]
+    xw, yw, zw = R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]
+    trace = xx + yy + zz
+    elements = [
+        *(1.0 - trace + 2.0 * xx, xy, xz, xw),
+        *(xy, 1.0 - trace + 2.0 * yy, yz, yw),
+        *(xz, yz, 1.0 - trace + 2.0 * zz, zw),
+        *(xw, yw, zw, 1.0 + trace),
+    ]
+    rows = np.stack(elements, axis=-1).reshape(*R.shape[:-2], 4, 4)
+    largest = np.argmax(np.stack([xx, yy, zz, trace], axis=-1), axis=-1)
+    quat = np.take_along_axis(rows, largest[..., None, None], axis=-2)[..., 0, :]
+    quat = quat / _length(quat)[..., None]
     return np.asarray(np.where(quat[..., 3:] < 0.0, -quat, quat))
 
 
@@ -176,15 +193,28 @@ def interpolate_pose(first: Pose, second: Pose, fraction: float) -> Pose:
     return Pose(first.rotation @ turn, translation_m)
 
 
-def _quaternion_products() -> Array:
-    """C (9, 16): the elements of R are C vec(q q^T), and vec(4 q q^T) = vec(I) + C^T vec(R)."""
-    w = 3
-    C = np.zeros((3, 3, 4, 4))
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        C[i, i] = np.diag([1.0 if a in (i, w) else -1.0 for a in range(4)])
-        C[i, j, [i, j], [j, i]] = C[j, i, [i, j], [j, i]] = 1.0
-        C[i, j, [k, w], [w, k]], C[j, i, [k, w], [w, k]] = -1.0, 1.0
-    return C.reshape(9, 16)
+def _rotations_from_unit(quat_xyzw: Array) -> Array:
+    """Rotation matrices (..., 3, 3) of quaternions (..., 4) of length one."""
+    x, y, z, w = (quat_xyzw[..., k] for k in range(4))
+    xx, yy, zz, ww = x * x, y * y, z * z, w * w
+    xy, xz, yz, xw, yw, zw = x * y, x * z, y * z, x * w, y * w, z * w
+    elements = [
+        *(xx - yy - zz + ww, 2.0 * (xy - zw), 2.0 * (xz + yw)),
+        *(2.0 * (xy + zw), -xx + yy - zz + ww, 2.0 * (yz - xw)),
+        *(2.0 * (xz - yw), 2.0 * (yz + xw), -xx - yy + zz + ww),
+    ]
+    return np.stack(elements, axis=-1).reshape(*quat_xyzw.shape[:-1], 3, 3)
 
 
-_QUATERNION_PRODUCTS = _quaternion_products()
+def _length(vectors: Array) -> Array:
+    """Of vectors (..., N), each (...,); summed one after the other, as SciPy does it."""
+    squares = vectors[..., 0] * vectors[..., 0]
+    for k in range(1, vectors.shape[-1]):
+        squares = squares + vectors[..., k] * vectors[..., k]
+    return np.asarray(np.sqrt(squares))
+
+
+def _each(function: Callable[..., float], *values: Array) -> Array:
+    """The C library's own sine and the like: numpy's of many at once may differ in the last bit."""
+    flat = (value.ravel().tolist() for value in values)
+    return np.array([function(*each) for each in zip(*flat, strict=True)]).reshape(values[0].shape)
