@@ -3,7 +3,10 @@
 Poses and points are free in those steps, so what they can absorb is not held against the calibration. The
 covariance is the sandwich estimate of J. White, "Maximum likelihood estimation of misspecified models", 1982,
 clustered over stretches of the drive (Liang and Zeger, 1986): reprojection errors go together along a track and
-between neighbouring tracks, and counting every one of them as a witness would make anything significant.
+between neighbouring tracks, and counting every one of them as a witness would make anything significant. A short
+drive has few stretches, so before the calibration is changed, what they agree on is held against Student's
+distribution, not Gauss's (C. Cameron, D. Miller, "A practitioner's guide to cluster-robust inference", J. Human
+Resources 50, 2015, section VI).
 """
 
 from __future__ import annotations
@@ -14,6 +17,7 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
+from scipy.stats import norm, t
 
 from fleetmap.camera import Camera
 from fleetmap.errors import CalibrationError
@@ -44,7 +48,7 @@ IntArray = NDArray[np.int64]
 _STEPS = 4
 _DAMPING = 1e-8  # the free directions of a map without fixes say nothing about the calibration
 _MAX_OBSERVATIONS = 40_000  # more landmarks than that are thinned out: seconds, and as clear an answer
-_CLUSTERS = 20  # stretches of the drive that count as independent witnesses
+_CLUSTERS = 20  # stretches of the drive, at most, that count as independent witnesses
 
 
 @dataclass(frozen=True)
@@ -52,6 +56,7 @@ class Disagreement:
     """One part of the calibration: how far the drive's own estimate lies from the recorded one."""
 
     sigmas: float  # how clear
+    normal_sigmas: float  # as improbable by chance, were there no end of witnesses
     border_px: float  # how large, in pixels at the image border
 
 
@@ -79,7 +84,9 @@ def estimate_calibration(
         state, _ = optimise(graph, _STEPS)
         images, rest = graph.linearised(state)
         step = solve_bordered(images, rest, state.change, _DAMPING)
-        return _judged(prior, state.change, _covariance(images, rest, step))
+        clusters = _clusters(images)
+        freedom = int(clusters.max(initial=0))
+        return _judged(prior, state.change, _covariance(images, rest, step, clusters), freedom)
     except (np.linalg.LinAlgError, RuntimeError, CalibrationError) as error:  # RuntimeError: SuperLU, singular
         _log.info("the calibration could not be checked: %s", error)
         return None
@@ -108,7 +115,7 @@ def is_contradicted(estimate: CalibrationEstimate | None, settings: CalibrationG
     if estimate is None:
         return False
     return any(
-        part.sigmas > settings.adopt_sigmas and part.border_px > settings.adopt_border_px
+        part.normal_sigmas > settings.adopt_sigmas and part.border_px > settings.adopt_border_px
         for part in (estimate.focal, estimate.centre, estimate.lens)
     )
 
@@ -143,7 +150,7 @@ def calibration_remarks(
     return [f"{line}; {advice}" for line in found]
 
 
-def _judged(prior: CalibrationPrior, change: Array, covariance: Array) -> CalibrationEstimate:
+def _judged(prior: CalibrationPrior, change: Array, covariance: Array, freedom: int) -> CalibrationEstimate:
     recorded, fitted = prior.recorded, prior.camera(change)
     sigmas = np.sqrt(np.diag(covariance)) * prior.sigmas
     border = recorded.normalise(border_points(recorded))
@@ -154,23 +161,37 @@ def _judged(prior: CalibrationPrior, change: Array, covariance: Array) -> Calibr
         float(sigmas[0] * _focal_px(fitted)),
         (float(sigmas[2]), float(sigmas[3])),
         tuple(sigmas[LENS].tolist()),
-        _disagreement(by_change[:, :, FOCAL], change[FOCAL], covariance[FOCAL, FOCAL]),
-        _disagreement(by_change[:, :, CENTRE], change[CENTRE], covariance[CENTRE, CENTRE]),
-        _disagreement(by_change[:, :, LENS], change[LENS], covariance[LENS, LENS]),
+        _disagreement(by_change[:, :, FOCAL], change[FOCAL], covariance[FOCAL, FOCAL], freedom),
+        _disagreement(by_change[:, :, CENTRE], change[CENTRE], covariance[CENTRE, CENTRE], freedom),
+        _disagreement(by_change[:, :, LENS], change[LENS], covariance[LENS, LENS], freedom),
     )
 
 
-def _disagreement(by_change: Array, change: Array, covariance: Array) -> Disagreement:
+def _disagreement(by_change: Array, change: Array, covariance: Array, freedom: int) -> Disagreement:
     """At the border point where one part of the calibration shifts pixels most, and how sure that shift is."""
     shifts = by_change @ change
     lengths = np.linalg.norm(shifts, axis=1)
     worst = int(np.argmax(lengths))
     along = (shifts[worst] / max(lengths[worst], 1e-12)) @ by_change[worst]
     sigma = float(np.sqrt(along @ covariance @ along))
-    return Disagreement(float(lengths[worst]) / max(sigma, 1e-12), float(lengths[worst]))
+    sigmas = float(lengths[worst]) / max(sigma, 1e-12)
+    return Disagreement(sigmas, _normal_sigmas(sigmas, freedom), float(lengths[worst]))
 
 
-def _covariance(images: LinearisedImages, rest: LinearisedRest, step: BorderedStep) -> Array:
+def _normal_sigmas(sigmas: float, freedom: int) -> float:
+    """How many sigmas of a normal distribution are as improbable as these of Student's; 0 without any freedom."""
+    if freedom < 1:
+        return 0.0
+    return float(norm.isf(max(float(t.sf(sigmas, freedom)), 1e-300)))
+
+
+def _clusters(images: LinearisedImages) -> IntArray:
+    """The stretch of the drive (P,) that each landmark belongs to: that of the first keyframe to see it."""
+    stretch = max(1, -(-images.keyframes // _CLUSTERS))
+    return np.asarray(images.keyframe_index[images.starts[:-1]] // stretch, dtype=np.int64)
+
+
+def _covariance(images: LinearisedImages, rest: LinearisedRest, step: BorderedStep, clusters: IntArray) -> Array:
     """Of the calibration (C, C): the larger of the graph's own and the clustered sandwich."""
     k, counts = images.keyframe_index, np.diff(images.starts)
     point_index = np.repeat(np.arange(len(counts)), counts)
@@ -180,8 +201,6 @@ def _covariance(images: LinearisedImages, rest: LinearisedRest, step: BorderedSt
     # A track's own point fits three of its 2 n errors away, whatever their sigma; what is left is too small.
     left = 2.0 * counts / np.maximum(2.0 * counts - 3.0, 1.0)
     scores = (images.residuals[:, None, :] @ rows)[:, 0] * left[point_index][:, None]
-    stretch = max(1, -(-images.keyframes // _CLUSTERS))
-    clusters = k[images.starts[:-1]] // stretch if len(counts) else np.zeros(0, np.int64)
     by_cluster = _sum_rows(scores, clusters[point_index], int(clusters.max(initial=0)) + 1)
     by_rest = rest.jacobian @ step.poses_by_calibration
     own = np.asarray(np.linalg.inv(step.information), dtype=np.float64)

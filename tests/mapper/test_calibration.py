@@ -201,6 +201,13 @@ def test_a_wrong_calibration_is_told_with_numbers(recorded):
         )
 
 
+def test_what_few_stretches_of_road_agree_on_is_less_clear_than_its_sigmas():
+    estimate = checked(driven(off(BROWN), BROWN, seed=5))
+    for part in (estimate.focal, estimate.centre, estimate.lens):
+        assert 0.4 * part.sigmas < part.normal_sigmas < part.sigmas
+    assert estimate.focal.sigmas > SETTINGS.adopt_sigmas > estimate.focal.normal_sigmas
+
+
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("correlated_px", [0.0, 1.0], ids=["white noise", "noise along tracks"])
 def test_a_right_calibration_is_left_in_peace(seed, correlated_px):

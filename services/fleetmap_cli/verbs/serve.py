@@ -66,8 +66,8 @@ class _HostPort(click.ParamType[tuple[str, int]]):
     "localizers",
     metavar="tcp/HOST:PORT",
     multiple=True,
-    help="A 'fleetmap locator' that images sent to POST /localize are handed on to, with the sender's token; it need "
-    "not be there yet. May be given repeatedly.",
+    help="A 'fleetmap locator' that images sent to POST /localize are handed on to, with the sender's token; it "
+    "need not be there yet. May be given repeatedly.",
 )
 @click.option(
     "--http",
