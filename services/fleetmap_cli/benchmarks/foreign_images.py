@@ -27,7 +27,8 @@ from fleetmap_localizer.settings import LocalizerSettings
 Image = NDArray[np.uint8]
 Spoiler = Callable[[Image, np.random.Generator], Image]
 
-OTHER, ALIKE, TWIN = "another street", "houses that look alike", "the same street, every other surface repainted"
+OTHER, ALIKE = "another street", "houses that look alike"
+TWIN = "a street of the same shape, a quarter of its surfaces the same"
 _FIRST_DRAW = 1000
 _IMAGES_PER_STREET = 12
 _STEP_NS = 100_000_000
