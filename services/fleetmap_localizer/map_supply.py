@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Protocol
 
-from fleetmap.camera import Camera
-from fleetmap_localizer.map_view import LocalizableMap, MapView
+from fleetmap_localizer.map_view import MapView
 from fleetmap_localizer.pose_estimate import NoPose, PoseEstimate
-from fleetmap_localizer.settings import LocalizerSettings
 
 
 class MapSupply(Protocol):
@@ -27,20 +24,3 @@ class MapSupply(Protocol):
 
     def close(self) -> None:
         """End what goes on in the background."""
-
-
-class WholeMaps:
-    """Maps that are at hand as a whole, wherever the vehicle is."""
-
-    def __init__(self, maps: Iterable[LocalizableMap], camera: Camera, settings: LocalizerSettings) -> None:
-        self._views = tuple(MapView(each, camera, settings) for each in maps)
-
-    def views(self) -> tuple[MapView, ...]:
-        """All of them."""
-        return self._views
-
-    def moved(self, pose: PoseEstimate | NoPose) -> None:
-        """Nothing comes or goes."""
-
-    def close(self) -> None:
-        """Nothing goes on."""

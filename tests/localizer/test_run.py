@@ -8,14 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fleetmap.camera import Camera
 from fleetmap.drive import Frame, WheelSpeed
 from fleetmap.drives import open_drive
 from fleetmap.drives.ros2_writer import DriveWriter
 from fleetmap.errors import DriveError, NoPoseError, ServerError
 from fleetmap_localizer.dead_reckoning import DeadReckoning
 from fleetmap_localizer.map_source import read_map
-from fleetmap_localizer.map_supply import WholeMaps
-from fleetmap_localizer.map_view import LocalizableMap
+from fleetmap_localizer.map_view import LocalizableMap, MapView
 from fleetmap_localizer.pose_estimate import NoPose, PoseEstimate
 from fleetmap_localizer.run import DROPPED, LocalizedDrive, localize_drive
 from fleetmap_localizer.settings import LocalizerSettings
@@ -35,20 +35,26 @@ def elsewhere(street_map) -> LocalizableMap:
     return replace(street_map, map_id="elsewhere", content=content)
 
 
-@pytest.fixture(scope="module")
-def supply(street_map, elsewhere, second_drive) -> WholeMaps:
-    return WholeMaps([elsewhere, street_map], second_drive.camera, LocalizerSettings())
+class ListeningSupply:
+    """Maps as a whole; remembers where it was told that the vehicle is."""
 
-
-class ListeningSupply(WholeMaps):
-    """Remembers where it was told that the vehicle is."""
-
-    def __init__(self, *arguments) -> None:
-        super().__init__(*arguments)
+    def __init__(self, maps: list[LocalizableMap], camera: Camera) -> None:
+        self._views = tuple(MapView(each, camera, LocalizerSettings()) for each in maps)
         self.told: list[PoseEstimate | NoPose] = []
+
+    def views(self) -> tuple[MapView, ...]:
+        return self._views
 
     def moved(self, pose: PoseEstimate | NoPose) -> None:
         self.told.append(pose)
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.fixture
+def supply(street_map, elsewhere, second_drive) -> ListeningSupply:
+    return ListeningSupply([elsewhere, street_map], second_drive.camera)
 
 
 def test_a_drive_becomes_a_utm_trajectory_in_the_map_that_knows_the_place(
@@ -92,7 +98,7 @@ def test_reasons_that_differ_in_numbers_only_are_counted_together() -> None:
 def test_queries_on_their_own_do_not_depend_on_the_images_before(street_map, second_drive, foreign_drive) -> None:
     """Backwards, with others between, each gives the same pose; and nobody is told where the vehicle is."""
     camera = second_drive.camera
-    supply = ListeningSupply([street_map], camera, LocalizerSettings())
+    supply = ListeningSupply([street_map], camera)
     forwards = localize_drive(second_drive.frames[:6:2], camera, supply, independent=True)
     mixed = [*second_drive.frames[4::-2], foreign_drive.frames[0]]
     backwards = localize_drive(mixed, camera, supply, independent=True)
@@ -163,7 +169,7 @@ def test_predictions_fill_gaps_and_stay_apart_from_what_was_measured(
         for stamp_ns in range(frames[0].stamp_ns, frames[5].stamp_ns, 20_000_000):
             writer.write_wheel_speed(WheelSpeed(stamp_ns, 10.0))
     reckoning = DeadReckoning.for_drive(open_drive(tmp_path / "wheels.mcap"), use_gnss=False)
-    supply = ListeningSupply([street_map], camera, LocalizerSettings())
+    supply = ListeningSupply([street_map], camera)
     elsewhere = [replace(foreign_drive.frames[i], stamp_ns=frames[i].stamp_ns) for i in (3, 4)]
     result = localize_drive([*frames[:3], *elsewhere, frames[5]], camera, supply, reckoning=reckoning)
     assert [pose.stamp_ns for pose in result.predicted] == [frame.stamp_ns for frame in elsewhere]

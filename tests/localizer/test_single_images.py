@@ -11,7 +11,6 @@ import pytest
 from fleetmap.errors import CalibrationError
 from fleetmap.localization import Localized
 from fleetmap_localizer.map_source import read_map
-from fleetmap_localizer.map_supply import WholeMaps
 from fleetmap_localizer.map_view import MapView
 from fleetmap_localizer.settings import LocalizerSettings
 from fleetmap_localizer.single_images import UnreadableImageError, locate
@@ -21,7 +20,7 @@ NUMBER = 6  # of the image in the second drive
 
 @pytest.fixture(scope="module")
 def views(mapped_street, second_drive) -> tuple[MapView, ...]:
-    return WholeMaps([read_map(mapped_street.package)], second_drive.camera, LocalizerSettings()).views()
+    return (MapView(read_map(mapped_street.package), second_drive.camera, LocalizerSettings()),)
 
 
 @pytest.fixture(scope="module")

@@ -10,8 +10,8 @@ import pytest
 from fleetmap.camera import Camera
 from fleetmap.errors import NoPoseError
 from fleetmap_localizer.map_source import read_map
-from fleetmap_localizer.map_supply import WholeMaps
 from fleetmap_localizer.map_view import LocalizableMap, MapView
+from fleetmap_localizer.pose_estimate import NoPose, PoseEstimate
 from fleetmap_localizer.settings import LocalizerSettings
 from fleetmap_localizer.supplies import LatLon, Supplies
 
@@ -19,18 +19,21 @@ CAMERA, OTHER_CAMERA = Camera(64, 48, 50.0, 50.0, 31.5, 23.5), Camera(64, 48, 60
 HERE = (49.00001, 8.40001)
 
 
-class NotedMaps(WholeMaps):
-    """The street's map, and a note in the log when it is closed."""
+class NotedMaps:
+    """The street's map as a whole, and a note in the log when it is closed."""
 
     def __init__(self, log: list[str], name: str, content: LocalizableMap | None, camera: Camera) -> None:
-        super().__init__([] if content is None else [content], camera, LocalizerSettings())
-        self._log, self._name, self._is_empty = log, name, content is None
+        self._views = () if content is None else (MapView(content, camera, LocalizerSettings()),)
+        self._log, self._name = log, name
         log.append(f"open {name}")
 
     def views(self) -> tuple[MapView, ...]:
-        if self._is_empty:
+        if not self._views:
             raise NoPoseError("no map here")
-        return super().views()
+        return self._views
+
+    def moved(self, pose: PoseEstimate | NoPose) -> None:
+        pass
 
     def close(self) -> None:
         self._log.append(f"close {self._name}")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import closing
-from functools import partial
 from pathlib import Path
 
 import click
@@ -11,7 +10,6 @@ import click
 from fleetmap.camera import Camera
 from fleetmap.transport import MapClient
 from fleetmap_cli.options import ServerAccess, waiting_server_options
-from fleetmap_cli.patient_server import REQUEST_PATIENCE_S
 from fleetmap_cli.watching import stop_on_signals
 from fleetmap_localizer.map_source import MapServer
 from fleetmap_localizer.map_supply import MapSupply
@@ -54,7 +52,7 @@ def locator(server: ServerAccess, zenoh: str, cache: Path | None) -> None:
     settings = LocalizerSettings()
 
     def open_supply(camera: Camera, near: LatLon | None) -> MapSupply:
-        origin = MapServer(server.endpoint, partial(server.connect, patience_s=REQUEST_PATIENCE_S))
+        origin = MapServer(server.endpoint, server.connect)
         return map_supply_of(origin, camera, settings, near_lat_lon_deg=near, cache=cache)
 
     def connect_as(token: str | None) -> MapClient:

@@ -15,6 +15,7 @@ from fleetmap_server.http.footprint_figure import Road, footprint_figure
 from fleetmap_server.http.html import Child, Html, element
 from fleetmap_server.http.page_layout import facts, length, next_page, page, short_hash, size, table, utc, verdict
 from fleetmap_server.http.quality_rows import quality_rows
+from fleetmap_server.http.stac_items import map_item_id
 
 _SHOWN = 300  # rows of one table
 
@@ -176,7 +177,7 @@ def _how_to_get(entry: MapEntry, zenoh_endpoint: str, http_url: str) -> list[Chi
         ("manifest", f"{here}/manifest.json{asked}"),
         ("trajectory as GeoJSON", f"{here}/trajectory.geojson{asked}"),
         ("preview of the landmarks as PLY", f"{here}/preview.ply{asked}"),
-        ("STAC item", f"/collections/maps/items/{_item_id(entry)}"),
+        ("STAC item", f"/collections/maps/items/{map_item_id(entry)}"),
     )
     return [
         element("p", "A vehicle takes what it needs of it by itself:"),
@@ -185,10 +186,6 @@ def _how_to_get(entry: MapEntry, zenoh_endpoint: str, http_url: str) -> list[Chi
         element("pre", element("code", f"curl -O {http_url}{here}/manifest.json")),
         element("ul", [element("li", element("a", name, href=href)) for name, href in links]),
     ]
-
-
-def _item_id(entry: MapEntry) -> str:
-    return entry.map_id if entry.is_latest else f"{entry.map_id}.v{entry.number}"
 
 
 def _versions(shown: MapEntry, versions: Sequence[MapEntry]) -> Html:

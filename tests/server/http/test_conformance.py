@@ -21,9 +21,9 @@ import shapely
 from fleetmap.jobs import DriveSummary
 from fleetmap.transport import MapClient
 from fleetmap.transport.localizers import LocalizerPool
-from fleetmap_localizer.map_supply import WholeMaps
+from fleetmap_localizer.map_view import MapView
+from fleetmap_localizer.pose_estimate import NoPose, PoseEstimate
 from fleetmap_localizer.pose_service import PoseService
-from fleetmap_localizer.settings import LocalizerSettings
 from fleetmap_localizer.supplies import Supplies
 from fleetmap_server.http.app import create_app
 from fleetmap_server.library import open_library
@@ -40,6 +40,19 @@ def locator_endpoint() -> str:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+class NoMaps:
+    """What a localizer has where no road was mapped."""
+
+    def views(self) -> tuple[MapView, ...]:
+        return ()
+
+    def moved(self, pose: PoseEstimate | NoPose) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +72,7 @@ def address(tmp_path_factory, make_map, publish, serving, module_endpoint, locat
         for seed in range(3):  # last, so that it is what comes first in every list
             publish(library, make_map(map_id="map000", seed=seed, path_lonlat=((20.2, 20.2), (20.8, 20.8))))
         stack.enter_context(ZenohFace(library, module_endpoint))  # where the localizer asks who may ask it
-        supplies = Supplies(lambda camera, near: WholeMaps((), camera, LocalizerSettings()))
+        supplies = Supplies(lambda camera, near: NoMaps())
         connect = partial(MapClient, module_endpoint)
         service = PoseService(locator_endpoint, lambda token: connect(token=token), supplies)
         stack.enter_context(contextlib.closing(service))
