@@ -7,15 +7,16 @@ from collections.abc import Generator, Iterable
 from fleetmap.camera import Camera
 from fleetmap.drive import Frame
 from fleetmap.read_ahead import read_ahead
-from fleetmap.vision.features import FeatureExtractor, Features, FeatureSettings
+from fleetmap.vision.features import FeatureExtractor, FeatureSettings
+from fleetmap_localizer.query_image import QueryImage
 
 _IMAGES_AHEAD = 2
 
 
 def with_features(
     frames: Iterable[Frame], camera: Camera, settings: FeatureSettings | None = None
-) -> Generator[tuple[Frame, Features], None, None]:
-    """Each frame and its features, in order; frames are read by one other thread, features found by a second.
+) -> Generator[QueryImage, None, None]:
+    """Each frame with its features, in order; frames are read by one other thread, features found by a second.
 
     At most two images are in advance of the caller at either. For recordings that are worked through as fast as it
     goes: a frame that is only due later must not be asked for now. Closing the iterator ends the threads.
@@ -26,4 +27,4 @@ def with_features(
     """
     extractor = FeatureExtractor(camera, settings)
     read = read_ahead(frames, _IMAGES_AHEAD)
-    yield from read_ahead(((frame, extractor.extract(frame.image)) for frame in read), _IMAGES_AHEAD)
+    yield from read_ahead((QueryImage.of(frame, extractor) for frame in read), _IMAGES_AHEAD)

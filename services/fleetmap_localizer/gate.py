@@ -1,8 +1,9 @@
-"""Whether a pose is worth reporting: no pose rather than a wrong one.
+"""Whether a pose is worth considering: no pose rather than a wrong one.
 
 Houses, cars and windows repeat. A copy of one of them at the wrong place can gather a hundred consistent matches;
 but it gathers them in one part of the image, while elsewhere the map's landmarks are not where the pose says.
-So it counts how much of the view agrees, beside how many landmarks do.
+So it counts how much of the view agrees, beside how many landmarks do. A pose that nothing before vouches for must
+show more, see fleetmap_localizer.likeness.
 
 How many must agree depends on how many could: where a map promises 2,500 landmarks, 30 of them find something
 alike near a wrong pose; where it promises 100, not 15 of them do. So the count is held against what chance would

@@ -6,11 +6,12 @@ from collections.abc import Sequence
 
 from fleetmap.camera import Camera
 from fleetmap.drive import Frame
-from fleetmap.vision.features import FeatureExtractor, Features
+from fleetmap.vision.features import FeatureExtractor
 from fleetmap_localizer.map_view import MapView
 from fleetmap_localizer.motion import Motion
 from fleetmap_localizer.pose_estimate import NoPose, PoseEstimate
 from fleetmap_localizer.pose_uncertainty import pose_covariance
+from fleetmap_localizer.query_image import QueryImage
 from fleetmap_localizer.relocalization import Located, is_same, relocalize
 from fleetmap_localizer.settings import LocalizerSettings
 from fleetmap_localizer.tracking import can_reach, has_lost_support, track
@@ -44,15 +45,16 @@ class Localizer:
         Raises:
             CalibrationError: the image does not have the calibrated size.
         """
-        return self.localize_features(self._extractor.extract(frame.image), frame.stamp_ns)
+        return self.localize_image(QueryImage.of(frame, self._extractor))
 
-    def localize_features(self, features: Features, stamp_ns: int) -> PoseEstimate | NoPose:
+    def localize_image(self, image: QueryImage) -> PoseEstimate | NoPose:
         """The same for an image whose features are known already."""
+        stamp_ns = image.stamp_ns
         motion = self._recent_motion(stamp_ns)
-        tracked = None if motion is None else self._track(features, stamp_ns, motion)
+        tracked = None if motion is None else self._track(image, motion)
         answer: Located | str | None = tracked
         if motion is None or tracked is None or motion.is_fresh or self._lost_support(tracked, motion):
-            answer = _stronger(tracked, self._relocalize(features, stamp_ns, motion))
+            answer = _stronger(tracked, self._relocalize(image, motion))
         if answer is None or isinstance(answer, str):
             return NoPose(stamp_ns, answer or _NO_CONTINUATION)
         if tracked and not is_same(answer, tracked):
@@ -68,21 +70,21 @@ class Localizer:
             inlier_count=answer.inlier_count,
         )
 
-    def _track(self, features: Features, stamp_ns: int, motion: Motion) -> Located | None:
+    def _track(self, image: QueryImage, motion: Motion) -> Located | None:
         """Go on in the map of the pose before; where it does not show the place any more, in another."""
         for view in sorted(self._views, key=motion.distance_to):
-            fit = track(view, self._camera, features, stamp_ns, motion, self._settings)
+            fit = track(view, self._camera, image, motion, self._settings)
             if fit is not None:
                 return Located(view, fit)
         return None
 
-    def _relocalize(self, features: Features, stamp_ns: int, motion: Motion | None) -> Located | str:
+    def _relocalize(self, image: QueryImage, motion: Motion | None) -> Located | str:
         """Search everywhere; against the motion only what has far more to speak for it than the place before."""
-        found = relocalize(self._views, self._camera, features, self._settings)
+        found = relocalize(self._views, self._camera, image, self._settings)
         if isinstance(found, str) or motion is None:
             return found
         overruled = found.inlier_count > self._settings.tracking.overruling_support * motion.inlier_count
-        if overruled or can_reach(found.view, motion, stamp_ns, found.fit, self._settings):
+        if overruled or can_reach(found.view, motion, image.stamp_ns, found.fit, self._settings):
             return found
         return _NO_CONTINUATION
 

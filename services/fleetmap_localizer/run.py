@@ -15,13 +15,14 @@ from fleetmap.covariances import PoseCovariances
 from fleetmap.drive import Frame
 from fleetmap.errors import NoPoseError, RunError
 from fleetmap.trajectory import Trajectory
-from fleetmap.vision.features import FeatureExtractor, Features, FeatureSettings
+from fleetmap.vision.features import FeatureExtractor, FeatureSettings
 from fleetmap_localizer.dead_reckoning import DeadReckoning
 from fleetmap_localizer.feature_stream import with_features
 from fleetmap_localizer.localizer import Localizer
 from fleetmap_localizer.map_supply import MapSupply
 from fleetmap_localizer.pose_estimate import NoPose, PoseEstimate
 from fleetmap_localizer.pose_files.tum_file import trajectory_of
+from fleetmap_localizer.query_image import QueryImage
 from fleetmap_localizer.settings import LocalizerSettings
 
 DROPPED = "dropped: the image before was still being worked on"
@@ -142,12 +143,12 @@ def localize_drive(
     try:
         supply.views()  # waits for the first map, so that no image that is due has to
         with closing(find(frames, camera, settings.features)) as images:
-            for frame, features in images:
+            for image in images:
                 localizer.use(views := supply.views())
                 map_ids.update((view.map_id, None) for view in views)
                 if independent:
                     localizer.forget()
-                answer = localizer.localize_features(features, frame.stamp_ns)
+                answer = localizer.localize_image(image)
                 answers.append(_with_prediction(answer, reckoning))
                 if not independent:
                     supply.moved(answers[-1])
@@ -158,10 +159,10 @@ def localize_drive(
 
 def _features_when_due(
     frames: Iterable[Frame], camera: Camera, settings: FeatureSettings
-) -> Generator[tuple[Frame, Features], None, None]:
+) -> Generator[QueryImage, None, None]:
     extractor = FeatureExtractor(camera, settings)
     for frame in frames:
-        yield frame, extractor.extract(frame.image)
+        yield QueryImage.of(frame, extractor)
 
 
 def _with_prediction(answer: PoseEstimate | NoPose, reckoning: DeadReckoning | None) -> PoseEstimate | NoPose:

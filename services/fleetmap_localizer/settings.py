@@ -19,12 +19,12 @@ class LocalMapSettings:
 
 @dataclass(frozen=True)
 class GateSettings:
-    """What a pose must show before it is believed: no pose is better than a wrong one."""
+    """What a pose must show before anything else is asked: no pose is better than a wrong one."""
 
-    chance_ratio: float  # of the landmarks that should be in view: how many may agree with a wrong pose
-    max_chance: float  # that so many agree with a wrong pose, see fleetmap_localizer.gate.chance_of
-    min_coverage: float  # share of the view's cells, where landmarks are expected, in which some agree
-    max_position_sigma_m: float
+    chance_ratio: float = 0.0075  # of the landmarks that should be in view: how many may agree with a wrong pose
+    max_chance: float = 1e-3  # that so many agree with a wrong pose, see fleetmap_localizer.gate.chance_of
+    min_coverage: float = 0.3  # share of the view's cells, where landmarks are expected, in which some agree
+    max_position_sigma_m: float = 0.3
     max_rotation_sigma_deg: float = 1.0
     min_inliers: int = 12  # for geometry's sake: six degrees of freedom, and how much they leave over
     min_inlier_ratio: float = 0.5  # inliers per matched landmark
@@ -43,9 +43,9 @@ class FittingSettings:
 class RelocalizationSettings:
     """The search from nothing."""
 
-    candidates: int = 8  # places tried
+    candidates: int = 24  # places tried
     min_score: float = 3.0  # of a place, in standard deviations of chance, to be tried
-    min_rival_score: float = 0.35  # of that of a place found; what is less alike is not tried any more
+    min_rival_score: float = 0.35  # of that of a clear place; what is less alike is not tried any more
     neighbours: int = 8  # covisible keyframes that join a candidate
     min_shared_landmarks: int = 15  # to call two keyframes covisible
     max_landmarks: int = 800  # of a candidate
@@ -55,11 +55,12 @@ class RelocalizationSettings:
     min_ransac_inliers: int = 10
     ransac_error_px: float = 6.0
     radii_px: tuple[float, ...] = (12.0, 5.0)  # windows around the projections, round after round
-    max_rival: float = 0.8  # another place with this share of the best's inliers makes the answer ambiguous
+    wide_radii_px: tuple[float, ...] = (60.0, 30.0, 12.0, 5.0)  # from a keyframe's pose
+    max_rival: float = 0.8  # another place with this share of the best's support makes the answer ambiguous
     min_lead_sigmas: float = 2.0  # of the best's inliers over those of a place that could be the answer as well
-    gate: GateSettings = GateSettings(
-        chance_ratio=0.015, max_chance=1e-6, min_coverage=0.55, max_position_sigma_m=0.2
-    )
+    min_place_score: float = 1.0  # see fleetmap_localizer.likeness.place_score
+    clear_place_score: float = 5.0  # what has it ends the search, but for places that are as much alike
+    min_score_lead: float = 4.0  # of the best over a rival, for the rival not to matter
 
 
 @dataclass(frozen=True)
@@ -74,10 +75,6 @@ class TrackingSettings:
     slack_m: float = 0.5
     min_vouched_support: float = 0.35  # of the inliers before; with fewer, the prediction vouches for nothing
     overruling_support: float = 2.0  # times the inliers before; a pose with more is believed against the motion
-    # Looser: a prediction from images before vouches for the place, and traffic may hide half the view.
-    gate: GateSettings = GateSettings(
-        chance_ratio=0.0075, max_chance=1e-3, min_coverage=0.3, max_position_sigma_m=0.3
-    )
 
 
 @dataclass(frozen=True)
@@ -87,6 +84,7 @@ class LocalizerSettings:
     features: FeatureSettings = field(default_factory=FeatureSettings)
     place_index: PlaceIndexSettings = field(default_factory=PlaceIndexSettings)
     local_map: LocalMapSettings = field(default_factory=LocalMapSettings)
+    gate: GateSettings = field(default_factory=GateSettings)
     fitting: FittingSettings = field(default_factory=FittingSettings)
     relocalization: RelocalizationSettings = field(default_factory=RelocalizationSettings)
     tracking: TrackingSettings = field(default_factory=TrackingSettings)

@@ -28,7 +28,7 @@ def near(mapped_street) -> tuple[float, float]:
 
 
 def localized(drive, supply: TileSupply, in_mid_drive: Callable[[], object]) -> LocalizedDrive:
-    """Localise the drive; something happens before its middle image."""
+    """Localise the drive; something happens before its middle image, and no image is read before its turn."""
 
     def frames() -> Iterator[Frame]:
         for number, frame in enumerate(drive.frames[: 2 * MIDDLE]):
@@ -36,7 +36,7 @@ def localized(drive, supply: TileSupply, in_mid_drive: Callable[[], object]) -> 
                 in_mid_drive()
             yield frame
 
-    return localize_drive(frames(), drive.camera, supply)
+    return localize_drive(frames(), drive.camera, supply, looks_ahead=False)
 
 
 def assert_no_gap(drive, result: LocalizedDrive) -> None:

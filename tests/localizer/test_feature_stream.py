@@ -27,12 +27,13 @@ def test_every_frame_comes_with_its_own_features() -> None:
     given = frames(5)
     alone = FeatureExtractor(CAMERA, SETTINGS)
     found = list(with_features(given, CAMERA, SETTINGS))
-    assert [frame for frame, _ in found] == given
-    for frame, features in found:
+    assert [image.stamp_ns for image in found] == [frame.stamp_ns for frame in given]
+    for frame, image in zip(given, found, strict=True):
         expected = alone.extract(frame.image)
-        assert np.array_equal(features.pixels, expected.pixels)
-        assert np.array_equal(features.descriptors, expected.descriptors)
-        assert len(features) > 50
+        assert np.array_equal(image.features.pixels, expected.pixels)
+        assert np.array_equal(image.features.descriptors, expected.descriptors)
+        assert len(image.features) > 50
+        assert np.array_equal(image.pyramid[0], frame.image)
 
 
 def test_reading_and_finding_happen_elsewhere_and_not_far_ahead() -> None:
@@ -56,7 +57,7 @@ def test_what_is_damaged_is_told_at_its_frame() -> None:
 
     for given, error in ((source(), DriveError), (iter([*frames(3), *frames(1, width=80)]), CalibrationError)):
         coming = with_features(given, CAMERA, SETTINGS)
-        assert [next(coming)[0].stamp_ns for _ in range(3)] == [0, 1, 2]
+        assert [next(coming).stamp_ns for _ in range(3)] == [0, 1, 2]
         with pytest.raises(error):
             next(coming)
 

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from fleetmap.geodesy import UtmAnchor
-from fleetmap.vision.features import FeatureExtractor, Features
+from fleetmap.vision.features import FeatureExtractor
 from fleetmap.visual_map import LocalizationMap
 from fleetmap_localizer.map_view import LocalizableMap, MapView
+from fleetmap_localizer.query_image import QueryImage
 from fleetmap_localizer.relocalization import Located, relocalize
 from fleetmap_localizer.settings import LocalizerSettings
 
@@ -19,9 +20,9 @@ ELSEWHERE_M = 4000
 
 
 @pytest.fixture(scope="module")
-def queries(second_drive) -> list[Features]:
+def queries(second_drive) -> list[QueryImage]:
     extractor = FeatureExtractor(second_drive.camera)
-    return [extractor.extract(frame.image) for frame in second_drive.frames[::4]]
+    return [QueryImage.of(frame, extractor) for frame in second_drive.frames[::4]]
 
 
 @pytest.fixture(scope="module")
@@ -59,8 +60,8 @@ def thinned(content: LocalizationMap, kept: float) -> LocalizationMap:
     )
 
 
-def answers(views: list[MapView], second_drive, queries: list[Features]) -> list[Located | str]:
-    return [relocalize(views, second_drive.camera, features, SETTINGS) for features in queries]
+def answers(views: list[MapView], second_drive, queries: list[QueryImage]) -> list[Located | str]:
+    return [relocalize(views, second_drive.camera, image, SETTINGS) for image in queries]
 
 
 def located(found: list[Located | str]) -> list[Located]:
@@ -90,6 +91,20 @@ def test_a_sparse_map_of_the_street_is_not_taken_for_its_denser_twin(
     right, wrong = thinned(mapped_street.content, 0.3), twin(mapped_street.content, 0.6)
     poses = located(answers([look_into(wrong, "twin"), look_into(right, "right")], second_drive, queries))
     assert "twin" not in {pose.view.map_id for pose in poses}
+
+
+def test_where_descriptors_alone_find_no_pose_those_of_the_keyframes_lead_on(
+    look_into, mapped_street, second_drive, queries
+) -> None:
+    deaf = replace(SETTINGS, relocalization=replace(SETTINGS.relocalization, min_matches=1_000_000))
+    view = look_into(mapped_street.content, "street")
+    both, alone = (
+        located([relocalize([view], second_drive.camera, image, settings) for image in queries])
+        for settings in (SETTINGS, deaf)
+    )
+    assert len(alone) == len(both) >= 0.9 * len(queries)
+    for one, other in zip(both, alone, strict=True):
+        assert np.allclose(one.utm_from_cam().translation_m, other.utm_from_cam().translation_m, atol=0.02)
 
 
 def test_two_maps_of_one_street_do_not_rival_each_other(look_into, mapped_street, second_drive, queries) -> None:

@@ -34,12 +34,14 @@ from fleetmap_localizer.settings import LocalizerSettings
 
 _WARM_UP_IMAGES = 5
 _STAGES: tuple[tuple[str, Any, str], ...] = (
-    ("features", FeatureExtractor, "extract"),
+    ("features", FeatureExtractor, "pyramid"),
+    ("features", FeatureExtractor, "extract_from"),
     ("places", relocalization, "PlaceSearch"),
     ("matching", relocalization, "match_descriptors"),
     ("matching", fitting, "match_by_projection"),
     ("matching", LocalMap, "landmarks_around"),
     ("matching", LocalMap, "predict"),
+    ("likeness", relocalization, "likeness_at"),
     ("pose", relocalization, "estimate_absolute_pose"),
     ("pose", fitting, "refine_absolute_pose"),
     ("pose", fitting, "relative_covariance"),
@@ -58,8 +60,8 @@ def time_queries(frames: Sequence[Frame], camera: Camera, views: Sequence[MapVie
     }
     localizer.forget()
     started_s = time.perf_counter()
-    for frame, features in with_features(frames, camera, settings.features):
-        localizer.localize_features(features, frame.stamp_ns)
+    for image in with_features(frames, camera, settings.features):
+        localizer.localize_image(image)
     return {
         "size": f"{camera.width_px}x{camera.height_px}",
         "images": len(frames),

@@ -69,12 +69,24 @@ class FeatureExtractor:
         Raises:
             CalibrationError: the image does not have the calibrated size.
         """
+        return self.extract_from(self.pyramid(image))
+
+    def pyramid(self, image: NDArray[np.uint8]) -> list[GreyImage]:
+        """The levels that features of a grey image (H, W) uint8 are found on, the image itself first.
+
+        Raises:
+            CalibrationError: the image does not have the calibrated size.
+        """
         self._check_size(image)
-        pyramid = image_pyramid(image, self.settings.levels, self.settings.scale_factor)
+        return image_pyramid(image, self.settings.levels, self.settings.scale_factor)
+
+    def extract_from(self, pyramid: list[GreyImage]) -> Features:
+        """Features of the image that ``pyramid`` was made of."""
+        shape = pyramid[0].shape
         chosen = self._chosen_corners(pyramid)
         descriptors = np.concatenate([describe(*on_level) for on_level in zip(pyramid, chosen, strict=True)])
         recorded = [
-            image_from_level_px(pixels.astype(np.float64), image.shape, level.shape)
+            image_from_level_px(pixels.astype(np.float64), shape, level.shape)
             for pixels, level in zip(chosen, pyramid, strict=True)
         ]
         octaves = np.repeat(np.arange(len(pyramid), dtype=np.uint8), [len(pixels) for pixels in chosen])
