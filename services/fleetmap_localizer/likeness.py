@@ -32,8 +32,8 @@ Array = NDArray[np.float64]
 _COLUMNS, _ROWS = 24, 12
 _MIN_IN_NEIGHBOURHOOD = 5  # landmarks in three by three cells, for their mean rank to mean something
 _ALIKE, _MUCH_ALIKE = 0.42, 0.2  # mean ranks
-_LANDMARK_ALIKE = 0.05  # rank
-_SAME_VIEW_DEG, _SAME_SIZE_OCTAVES = 8.0, 3.0
+_LANDMARK_ALIKE, _LANDMARK_UNMISTAKABLE = 0.05, 0.01  # ranks
+_SAME_VIEW_DEG, _SAME_SIZE_OCTAVES = 8.0, 2
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,8 @@ class Likeness:
 
     alike: float  # share of the view, where there are landmarks, that looks at all like them
     much_alike: float  # share that looks very much like them
-    landmarks_alike: float  # of the landmarks seen nearly as they were mapped, those that are told from all others
+    landmarks_alike: float  # share of the landmarks seen nearly as they were mapped that look like themselves
+    landmarks_unmistakable: float  # share of all landmarks that look more like themselves than 99 % of others do
 
 
 def likeness_at(view: MapView, camera: Camera, image: QueryImage, map_from_cam: Pose) -> Likeness:
@@ -51,7 +52,7 @@ def likeness_at(view: MapView, camera: Camera, image: QueryImage, map_from_cam: 
     recorded_px = camera.distort(predictions.pixels)
     known, seen = image.describe_at(recorded_px, predictions.octaves)
     if not known.any():
-        return Likeness(0.0, 0.0, 0.0)
+        return Likeness(0.0, 0.0, 0.0, 0.0)
     landmarks = predictions.landmarks[known]
     ranks = _ranks(seen[known], view.content.landmarks.descriptors[landmarks])
     local_means = _local_means(recorded_px[known], ranks, camera)
@@ -60,6 +61,7 @@ def likeness_at(view: MapView, camera: Camera, image: QueryImage, map_from_cam: 
         _share(local_means < _ALIKE),
         _share(local_means < _MUCH_ALIKE),
         _share(ranks[as_mapped] <= _LANDMARK_ALIKE),
+        _share(ranks <= _LANDMARK_UNMISTAKABLE),
     )
 
 
@@ -76,12 +78,12 @@ def place_score(likeness: Likeness, answer: AbsolutePose) -> float:
 
 
 def place_evidence(likeness: Likeness, position_sigma_m: float) -> Array:
-    """What is weighed (5,): the three shares, the logarithm of the sigma, and one."""
-    shares = (likeness.alike, likeness.much_alike, likeness.landmarks_alike)
+    """What is weighed (6,): the four shares, the logarithm of the sigma, and one."""
+    shares = (likeness.alike, likeness.much_alike, likeness.landmarks_alike, likeness.landmarks_unmistakable)
     return np.array([*shares, np.log(position_sigma_m), 1.0])
 
 
-PLACE_WEIGHTS = np.array([4.29, -8.54, 27.04, -2.21, -17.52])
+PLACE_WEIGHTS = np.array([12.76, -6.37, 11.29, 9.28, -0.91, -16.75])
 
 
 def _ranks(seen: NDArray[np.uint8], mapped: NDArray[np.uint8]) -> Array:
@@ -114,13 +116,12 @@ def _around(cells: NDArray[np.int64], weights: Array) -> Array:
 
 
 def _is_seen_as_mapped(view: MapView, predictions: Predictions, map_from_cam: Pose) -> NDArray[np.bool_]:
-    """Which landmarks (L,) are seen from nearly the direction and distance that they were mapped from."""
-    group = view.content.landmarks
-    to_camera = map_from_cam.translation_m - group.points_m[predictions.landmarks]
-    distances_m = np.linalg.norm(to_camera, axis=1)
-    cosines = np.einsum("li,li->l", to_camera, group.normals[predictions.landmarks]) / distances_m
-    octaves = np.log(distances_m / group.distances_m[predictions.landmarks]) / np.log(view.scale_factor)
-    return np.asarray((cosines > np.cos(np.radians(_SAME_VIEW_DEG))) & (np.abs(octaves) < _SAME_SIZE_OCTAVES))
+    """Which landmarks (L,) are seen from nearly the direction that they were mapped from, at nearly the size."""
+    group, landmarks = view.content.landmarks, predictions.landmarks
+    to_camera = map_from_cam.translation_m - group.points_m[landmarks]
+    cosines = np.einsum("li,li->l", to_camera, group.normals[landmarks]) / np.linalg.norm(to_camera, axis=1)
+    octaves = np.abs(predictions.octaves - group.octaves[landmarks].astype(np.int64))
+    return np.asarray((cosines > np.cos(np.radians(_SAME_VIEW_DEG))) & (octaves <= _SAME_SIZE_OCTAVES))
 
 
 def _share(flags: NDArray[np.bool_]) -> float:

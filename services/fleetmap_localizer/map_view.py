@@ -34,7 +34,6 @@ class MapView:
         """Prepare for images of ``camera``."""
         content = source.content
         self.map_id, self.version, self.content = source.map_id, source.version, content
-        self.scale_factor = settings.features.scale_factor
         self.local_map = LocalMap(
             content,
             float(np.sqrt(source.camera.fx_px * source.camera.fy_px)),

@@ -58,9 +58,9 @@ class RelocalizationSettings:
     wide_radii_px: tuple[float, ...] = (60.0, 30.0, 12.0, 5.0)  # from a keyframe's pose
     max_rival: float = 0.8  # another place with this share of the best's support makes the answer ambiguous
     min_lead_sigmas: float = 2.0  # of the best's inliers over those of a place that could be the answer as well
-    min_place_score: float = 1.0  # see fleetmap_localizer.likeness.place_score
-    clear_place_score: float = 5.0  # what has it ends the search, but for places that are as much alike
-    min_score_lead: float = 4.0  # of the best over a rival, for the rival not to matter
+    min_place_score: float = 0.5  # see place_score; of near-identical streets one in twenty is taken for the right
+    clear_place_score: float = 3.5  # what has it ends the search, but for places that are as much alike
+    min_score_lead: float = 3.0  # of the best over a rival, for the rival not to matter
 
 
 @dataclass(frozen=True)

@@ -68,6 +68,7 @@ def test_the_street_is_like_its_map_all_over_the_view(likeness_of) -> None:
         assert each.alike > 0.85
         assert each.much_alike > 0.4
         assert each.landmarks_alike > 0.5
+        assert 0.2 < each.landmarks_unmistakable < 0.8
 
 
 def test_in_the_dark_it_still_is(likeness_of) -> None:
@@ -81,6 +82,7 @@ def test_something_else_is_not(likeness_of) -> None:
         assert each.alike < 0.4
         assert each.much_alike < 0.1
         assert each.landmarks_alike < 0.15
+        assert each.landmarks_unmistakable < 0.05
 
 
 def test_of_half_a_street_half_is(likeness_of) -> None:
@@ -98,7 +100,7 @@ def test_a_pose_beside_the_true_one_is_told_as_well(likeness_of) -> None:
 def test_where_nothing_is_in_view_nothing_is_alike(view, second_drive) -> None:
     image = QueryImage.of(second_drive.frames[0], FeatureExtractor(second_drive.camera))
     far_above = Pose(np.eye(3), np.array([0.0, 0.0, 5000.0]))
-    assert likeness_at(view, second_drive.camera, image, far_above) == Likeness(0.0, 0.0, 0.0)
+    assert likeness_at(view, second_drive.camera, image, far_above) == Likeness(0.0, 0.0, 0.0, 0.0)
 
 
 def answer(position_sigma_m: float) -> AbsolutePose:
@@ -108,8 +110,8 @@ def answer(position_sigma_m: float) -> AbsolutePose:
 
 def test_a_place_scores_by_what_is_alike_and_by_how_firmly_its_pose_is_held() -> None:
     firm, loose = answer(0.03), answer(0.3)
-    likeness = Likeness(alike=0.9, much_alike=0.4, landmarks_alike=0.5)
+    likeness = Likeness(alike=0.8, much_alike=0.3, landmarks_alike=0.4, landmarks_unmistakable=0.2)
     assert place_score(likeness, firm) == pytest.approx(PLACE_WEIGHTS @ place_evidence(likeness, 0.03))
     assert place_score(likeness, firm) > SETTINGS.relocalization.min_place_score > place_score(likeness, loose)
-    for name, less in (("alike", 0.4), ("landmarks_alike", 0.2)):
+    for name, less in (("alike", 0.4), ("landmarks_alike", 0.2), ("landmarks_unmistakable", 0.05)):
         assert place_score(replace(likeness, **{name: less}), firm) < place_score(likeness, firm)

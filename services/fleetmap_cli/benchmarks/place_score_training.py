@@ -43,7 +43,7 @@ class Example:
     """The likeliest pose of one image."""
 
     draw: int
-    evidence: Array  # (5,) see fleetmap_localizer.likeness.place_evidence
+    evidence: Array  # (6,) see fleetmap_localizer.likeness.place_evidence
     is_right: bool
 
 
@@ -76,7 +76,7 @@ def _evidence(candidate: Candidate) -> Array:
 
 
 def learn(evidence: Array, is_right: NDArray[np.bool_]) -> Array:
-    """Weights (5,) of a logistic regression; right and wrong examples count as much, however many there are.
+    """Weights (6,) of a logistic regression; right and wrong examples count as much, however many there are.
 
     Source: Newton's method, as in C. Bishop, "Pattern recognition and machine learning", 2006, section 4.3.3.
     """
