@@ -97,12 +97,12 @@ def find_candidates(
     return found
 
 
-def is_this_place(view: MapView, camera: Camera, image: QueryImage, fit: Fit, settings: LocalizerSettings) -> bool:
-    """Whether a pose is believed with nothing else to vouch for it."""
-    if not is_trustworthy(fit, camera, settings.gate):
-        return False
+def judged(view: MapView, camera: Camera, image: QueryImage, fit: Fit, settings: LocalizerSettings) -> Candidate:
+    """A pose with all that speaks for it where nothing before vouches for it."""
     likeness = likeness_at(view, camera, image, fit.answer.map_from_cam)
-    return place_score(likeness, fit.answer) >= settings.relocalization.min_place_score
+    score = place_score(likeness, fit.answer)
+    is_like = score >= settings.relocalization.min_place_score
+    return Candidate(view, fit, likeness, score, is_like and is_trustworthy(fit, camera, settings.gate))
 
 
 def is_same(first: Located, second: Located) -> bool:
@@ -120,17 +120,18 @@ def _candidates_among(
     found: Sequence[Candidate],
     settings: LocalizerSettings,
 ) -> Iterator[Candidate]:
-    """What is new of the poses that landmarks of these keyframes lead to, until one of them is clear."""
+    """What is new of the poses that these keyframes lead to, until one of them is clear.
+
+    The caller adds to ``found`` what it is given, before it asks for the next.
+    """
     options = settings.relocalization
     for initial, radii_px in _guesses(view, camera, image.features, keyframes, found, options):
         fit = fit_around(view, camera, image.features, initial, radii_px, settings.fitting)
         if fit is None or any(_is_found(each, view, fit.answer.map_from_cam) for each in found):
             continue
-        likeness = likeness_at(view, camera, image, fit.answer.map_from_cam)
-        score = place_score(likeness, fit.answer)
-        is_trusted = score >= options.min_place_score and is_trustworthy(fit, camera, settings.gate)
-        yield Candidate(view, fit, likeness, score, is_trusted)
-        if score >= options.clear_place_score:
+        candidate = judged(view, camera, image, fit, settings)
+        yield candidate
+        if candidate.score >= options.clear_place_score:
             return
 
 

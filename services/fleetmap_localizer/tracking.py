@@ -9,7 +9,7 @@ from fleetmap_localizer.gate import Fit, is_trustworthy
 from fleetmap_localizer.map_view import MapView
 from fleetmap_localizer.motion import Motion
 from fleetmap_localizer.query_image import QueryImage
-from fleetmap_localizer.relocalization import is_this_place
+from fleetmap_localizer.relocalization import judged
 from fleetmap_localizer.settings import LocalizerSettings
 
 
@@ -59,4 +59,4 @@ def _continues(
         return False
     if fit.answer.inlier_count >= settings.tracking.min_vouched_support * motion.inlier_count:
         return is_trustworthy(fit, camera, settings.gate)
-    return is_this_place(view, camera, image, fit, settings)
+    return judged(view, camera, image, fit, settings).is_trusted
