@@ -73,14 +73,14 @@ def place_score(likeness: Likeness, answer: AbsolutePose) -> float:
     counts how firmly the landmarks hold the pose: what is alike by chance lies in one part of the view, and leaves
     it loose.
     """
-    sigma_m = float(np.sqrt(np.linalg.eigvalsh(answer.covariance[3:, 3:])[-1]))
-    return float(PLACE_WEIGHTS @ place_evidence(likeness, sigma_m))
+    return float(PLACE_WEIGHTS @ place_evidence(likeness, answer))
 
 
-def place_evidence(likeness: Likeness, position_sigma_m: float) -> Array:
-    """What is weighed (6,): the four shares, the logarithm of the sigma, and one."""
+def place_evidence(likeness: Likeness, answer: AbsolutePose) -> Array:
+    """What is weighed (6,): the four shares, the logarithm of the position's largest sigma in metres, and one."""
     shares = (likeness.alike, likeness.much_alike, likeness.landmarks_alike, likeness.landmarks_unmistakable)
-    return np.array([*shares, np.log(position_sigma_m), 1.0])
+    sigma_m = np.sqrt(np.linalg.eigvalsh(answer.covariance[3:, 3:])[-1])
+    return np.array([*shares, np.log(sigma_m), 1.0])
 
 
 PLACE_WEIGHTS = np.array([12.76, -6.37, 11.29, 9.28, -0.91, -16.75])

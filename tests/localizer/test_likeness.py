@@ -111,7 +111,7 @@ def answer(position_sigma_m: float) -> AbsolutePose:
 def test_a_place_scores_by_what_is_alike_and_by_how_firmly_its_pose_is_held() -> None:
     firm, loose = answer(0.03), answer(0.3)
     likeness = Likeness(alike=0.8, much_alike=0.3, landmarks_alike=0.4, landmarks_unmistakable=0.2)
-    assert place_score(likeness, firm) == pytest.approx(PLACE_WEIGHTS @ place_evidence(likeness, 0.03))
+    assert place_score(likeness, firm) == pytest.approx(PLACE_WEIGHTS @ place_evidence(likeness, firm))
     assert place_score(likeness, firm) > SETTINGS.relocalization.min_place_score > place_score(likeness, loose)
     for name, less in (("alike", 0.4), ("landmarks_alike", 0.2), ("landmarks_unmistakable", 0.05)):
         assert place_score(replace(likeness, **{name: less}), firm) < place_score(likeness, firm)

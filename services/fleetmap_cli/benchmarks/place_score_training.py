@@ -26,7 +26,7 @@ from fleetmap_cli.benchmarks.simulated_draws import STREETS, Draw
 from fleetmap_localizer.likeness import place_evidence
 from fleetmap_localizer.map_view import LocalizableMap, MapView
 from fleetmap_localizer.query_image import QueryImage
-from fleetmap_localizer.relocalization import Candidate, find_candidates
+from fleetmap_localizer.relocalization import find_candidates
 from fleetmap_localizer.settings import LocalizerSettings
 
 Array = NDArray[np.float64]
@@ -67,12 +67,8 @@ def _examples(
         best = max(found, key=lambda each: each.support)  # not by score: weights are what is to be learned
         away_m = float(np.linalg.norm(best.utm_from_cam().translation_m - utm_from_cam.translation_m))
         if draw.variant or not _RIGHT_M < away_m < _WRONG_M:
-            yield Example(draw.number, _evidence(best), draw.variant == 0 and away_m <= _RIGHT_M)
-
-
-def _evidence(candidate: Candidate) -> Array:
-    covariance = candidate.fit.answer.covariance
-    return place_evidence(candidate.likeness, float(np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1])))
+            evidence = place_evidence(best.likeness, best.fit.answer)
+            yield Example(draw.number, evidence, draw.variant == 0 and away_m <= _RIGHT_M)
 
 
 def learn(evidence: Array, is_right: NDArray[np.bool_]) -> Array:
