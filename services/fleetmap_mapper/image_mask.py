@@ -37,6 +37,7 @@ class ImageMask:
             pixels=features.pixels[kept],
             octaves=features.octaves[kept],
             descriptors=np.ascontiguousarray(features.descriptors[kept]),
+            angles_deg=features.angles_deg[kept],
         )
 
 

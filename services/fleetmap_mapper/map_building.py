@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.geodesy import UtmAnchor
+from fleetmap.vision.features import Features
 from fleetmap.vision.matching import medoid_descriptor
+from fleetmap.vision.upward import upward_deg
 from fleetmap.visual_map import Keyframes, Landmarks, Observations, VisualMap
 from fleetmap_mapper.growing_map import GrowingMap
 from fleetmap_mapper.placed_map import PlacedMap, octaves_of
@@ -41,13 +44,13 @@ def _landmarks(placed: PlacedMap, growing: GrowingMap, octaves: NDArray[np.uint8
     sums = np.zeros_like(placed.points_m)
     np.add.at(sums, placed.point_index, rays / distances[:, None])
     chosen = _medoid_observations(placed, growing)
-    descriptors = _descriptors(placed, growing, chosen)
     return Landmarks(
         placed.points_m,
-        descriptors,
+        _descriptors(placed, growing, chosen),
         (sums / np.linalg.norm(sums, axis=1)[:, None]).astype(np.float32),
         octaves[chosen],
         distances[chosen].astype(np.float32),
+        angles_deg=_angles_deg(placed, growing, chosen),
     )
 
 
@@ -65,8 +68,26 @@ def _medoid_observations(placed: PlacedMap, growing: GrowingMap) -> NDArray[np.i
 def _descriptors(placed: PlacedMap, growing: GrowingMap, observations: NDArray[np.int64]) -> NDArray[np.uint8]:
     """Descriptors (n, 32) behind some observations (n,)."""
     descriptors = np.empty((len(observations), 32), np.uint8)
+    for features, found, rows in _features_behind(placed, growing, observations):
+        descriptors[rows] = features.descriptors[found]
+    return descriptors
+
+
+def _angles_deg(placed: PlacedMap, growing: GrowingMap, observations: NDArray[np.int64]) -> NDArray[np.float32]:
+    """Orientations (n,) of the descriptors behind some observations (n,), from "up" in their images."""
+    in_image = np.empty(len(observations))
+    for features, found, rows in _features_behind(placed, growing, observations):
+        in_image[rows] = features.angles_deg[found]
+    up_in_cam = np.array([pose.rotation[2] for pose in placed.poses])[placed.keyframe_index[observations]]
+    upward = upward_deg(placed.camera, placed.pixels[observations], up_in_cam)
+    return np.asarray((in_image - upward) % 360.0, dtype=np.float32)
+
+
+def _features_behind(
+    placed: PlacedMap, growing: GrowingMap, observations: NDArray[np.int64]
+) -> Iterator[tuple[Features, NDArray[np.int32], NDArray[np.bool_]]]:
+    """By keyframe: its features, which of them are behind the observations (n,), and which of these it made."""
     keyframes, features = placed.keyframe_index[observations], placed.feature_index[observations]
     for keyframe in np.unique(keyframes):
         rows = keyframes == keyframe
-        descriptors[rows] = growing.keyframes[keyframe].features.descriptors[features[rows]]
-    return descriptors
+        yield growing.keyframes[keyframe].features, features[rows], rows

@@ -1,4 +1,4 @@
-"""Cell parts as maps of format 2 have them: about 40 bytes per landmark, of which 32 are its descriptor.
+"""Cell parts as maps of format 2 have them: about 41 bytes per landmark, of which 32 are its descriptor.
 
     array                  dtype  shape    holds
     keyframe_stamps_ns     <i8    (K,)     stamps, as differences
@@ -8,6 +8,7 @@
     landmark_descriptors   |u1    (N, 32)
     landmark_looks         |u1    (4, N)   octave, distance, azimuth and elevation of the normal
     landmark_sigmas        |u1    (2, N)   across and along the normal; may be missing
+    landmark_angles        |u1    (N,)     orientation of the descriptor; since format 2.1, may be missing
     landmark_runs          <u4    (N,)     runs of consecutive keyframes of the cell that see the landmark
     runs                   <u4    (2, R)   where a run begins, as differences; its length less 1
 
@@ -20,8 +21,9 @@ steps of 8 to 1,024 mm, the largest power of two that is at most a quarter of th
 are a quarter of a pixel at 30 m; what rounding to them errs, 2.3 mm, is part of the deviations that are stored.
 Rounding to more adds less than 1 % to the variance. Since every step divides 128 m, a landmark reads the same from
 every cell that holds it. Distances and deviations are logarithmic (see fleetmap.log_bytes): within 2 %, and up to
-8 % too large, never too small. Normals are rounded to 360/256 degrees, twice; orientations to 1e-5 rad. Where no
-deviations are known, positions are rounded to a millimetre.
+8 % too large, never too small. Normals are rounded to 360/256 degrees, twice; keyframes' orientations to 1e-5 rad,
+descriptors' to 360/64 degrees: ORB itself does not need them closer. Where no deviations are known, positions are
+rounded to a millimetre.
 """
 
 from __future__ import annotations
@@ -48,6 +50,7 @@ SIGMAS_M = LogBytes(_ROUNDING_M, 0.08)
 _STEPS_PER_SIGMA = 4.0
 _MIN_SHIFT, _MAX_SHIFT = 3, 10
 _UNITS_PER_RAD = 256.0 / (2.0 * np.pi)
+_ANGLES = 64  # of a descriptor
 
 
 def compact_arrays(cell: Cell, offset_m: NDArray[np.float64]) -> dict[str, NDArray[np.generic]]:
@@ -80,6 +83,8 @@ def compact_arrays(cell: Cell, offset_m: NDArray[np.float64]) -> dict[str, NDArr
     ).astype("|u1")
     if sigmas is not None:
         arrays["landmark_sigmas"] = sigmas.astype("|u1")
+    if landmarks.angles_deg is not None:
+        arrays["landmark_angles"] = (np.rint(landmarks.angles_deg * (_ANGLES / 360.0)) % _ANGLES).astype("|u1")
     arrays["landmark_runs"], arrays["runs"] = _runs_of(cell)
     return arrays
 
@@ -157,6 +162,7 @@ def _read_landmarks(part: Part, count: int, offset_m: NDArray[np.float64]) -> tu
     _check_ids(ids, "landmark ids", part.origin)
     octaves, distances, azimuth, elevation = part.array("landmark_looks", "|u1", (4, count))
     sigmas = part.array("landmark_sigmas", "|u1", (2, count)) if "landmark_sigmas" in part else None
+    angles = part.array("landmark_angles", "|u1", (count,)) if "landmark_angles" in part else None
     in_map_mm = (numbers[1:] << _shifts(sigmas)) + np.rint(offset_m * MM_PER_M)[:, None]
     azimuth_rad = azimuth / _UNITS_PER_RAD
     elevation_rad = elevation.view(np.int8) / _UNITS_PER_RAD
@@ -169,6 +175,7 @@ def _read_landmarks(part: Part, count: int, offset_m: NDArray[np.float64]) -> tu
         octaves,
         _DISTANCES_M.values(distances).astype(np.float32),
         None if sigmas is None else SIGMAS_M.values(sigmas.T).astype(np.float32),
+        None if angles is None else angles.astype(np.float32) * np.float32(360.0 / _ANGLES),
     )
 
 

@@ -32,6 +32,7 @@ _COLUMNS: dict[str, tuple[str, str, str, tuple[int, ...]]] = {
     "observation_octaves": ("|u1", "observations", "octaves", ()),
 }
 _COVARIANCES, _IS_DETERMINED = "keyframe_covariances", "keyframe_is_determined"  # since format 2
+_ANGLES = "landmark_angles_deg"  # since format 2.1
 _ROWS, _ROW_ENDS = np.triu_indices(6)
 _ORTHONORMAL_TOLERANCE = 1e-6
 _LEAST_VARIANCE = 1e-30
@@ -49,6 +50,8 @@ def encode_full(visual_map: VisualMap) -> bytes:
         determined = np.asarray(np.isfinite(covariances).all(axis=(1, 2)))
         arrays[_IS_DETERMINED] = determined.astype("|u1")
         arrays[_COVARIANCES] = np.where(determined[:, None], covariances[:, _ROWS, _ROW_ENDS], 0.0).astype("<f4")
+    if visual_map.landmarks.angles_deg is not None:
+        arrays[_ANGLES] = visual_map.landmarks.angles_deg.astype("<f4")
     return encode_part("full", full_attributes(visual_map.anchor), arrays)
 
 
@@ -66,12 +69,13 @@ def decode_full(data: bytes, manifest: Manifest, origin: str) -> VisualMap:
     groups: dict[str, dict[str, NDArray[Any]]] = {"keyframes": {}, "landmarks": {}, "observations": {}}
     for name, (dtype, group, field, row) in _COLUMNS.items():
         groups[group][field] = part.array(name, dtype, (None, *row))
+    angles_deg = part.array(_ANGLES, "<f4", (None,)) if _ANGLES in part else None
     visual_map = VisualMap(
         anchor,
         manifest.map_from_vis.to_sim3(),
         manifest.camera.to_camera(),
         Keyframes(**groups["keyframes"], covariances=_read_covariances(part)),
-        Landmarks(**groups["landmarks"]),
+        Landmarks(**groups["landmarks"], angles_deg=angles_deg),
         Observations(**groups["observations"]),
     )
     check_visual_map(visual_map, origin)
@@ -112,6 +116,9 @@ def check_visual_map(visual_map: VisualMap, origin: str) -> None:
     ):
         if (np.abs(points_m) > MAX_EXTENT_M).any():
             raise MapPackageError(f"{origin}: a {what} lies more than 1,000 km from the map's anchor")
+    angles_deg, shape = visual_map.landmarks.angles_deg, (len(visual_map.landmarks),)
+    if angles_deg is not None and not (angles_deg.shape == shape and np.isfinite(angles_deg).all()):
+        raise MapPackageError(f"{origin}: '{_ANGLES}' is not one finite number for each landmark")
     check_rotations(visual_map.keyframes.rotations, origin)
     check_covariances(visual_map.keyframes.covariances, len(visual_map.keyframes), origin)
     observations = visual_map.observations

@@ -33,7 +33,7 @@ from fleetmap.geodesy import UtmAnchor
 from fleetmap.geometry import Sim3, rotations_from_quat_xyzw
 
 FORMAT_NAME = "fleetmap-map"
-FORMAT_MAJOR, FORMAT_MINOR = 2, 0
+FORMAT_MAJOR, FORMAT_MINOR = 2, 1
 OLDEST_MAJOR = 1  # still read
 CELL_SIZE_M = 128
 MAX_MANIFEST_BYTES = 16 * 1024 * 1024

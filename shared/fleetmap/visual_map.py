@@ -49,6 +49,9 @@ class Landmarks:
     distances_m: NDArray[np.float32]  # (N,) float32 distance at which the descriptor was seen
     # (N, 2) float32 standard deviation across and along ``normals``; None where the map's writer did not say.
     sigmas_m: NDArray[np.float32] | None = None
+    # (N,) float32 orientation of the descriptor in its image as recorded, from the direction of "up" there (see
+    # fleetmap.vision.upward); None where the map's writer did not say.
+    angles_deg: NDArray[np.float32] | None = None
 
     def __len__(self) -> int:
         return len(self.points_m)

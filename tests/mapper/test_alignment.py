@@ -37,6 +37,7 @@ def growing_along(world):
             world.pixels[rows],
             np.zeros(len(rows), np.uint8),
             np.zeros((len(rows), 32), np.uint8),
+            np.zeros(len(rows), np.float32),
             1.2,
         )
         in_vis = Pose(pose.rotation, pose.translation_m / 5.0)

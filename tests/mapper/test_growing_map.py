@@ -25,6 +25,7 @@ def features(seed: int, count: int = FEATURES) -> Features:
         rng.uniform(0.0, 400.0, (count, 2)),
         rng.integers(0, 8, count).astype(np.uint8),
         rng.integers(0, 256, (count, 32), dtype=np.uint8),
+        np.zeros(count, np.float32),
         1.2,
     )
 

@@ -6,6 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from fleetmap.vision.features import FeatureExtractor, FeatureSettings
+from fleetmap.vision.upward import upward_deg
 from fleetmap_mapper.settings import MapperSettings
 
 
@@ -48,7 +49,7 @@ def test_every_landmark_projects_to_where_it_was_seen(mapped):
     assert errors.max() < 1.5 * within  # corners that could not be aligned are less exact than one pixel
 
 
-def test_a_landmarks_descriptor_is_one_of_its_own_with_octave_and_distance(survey_drive, mapped):
+def test_a_landmarks_descriptor_is_one_of_its_own_with_octave_distance_and_orientation(survey_drive, mapped):
     """Extracted again from its images: the medoid is one of the track's descriptors, and stands with its data."""
     content = mapped.visual_map
     extractor = FeatureExtractor(survey_drive.camera, FeatureSettings(count=MapperSettings().features.count))
@@ -62,9 +63,12 @@ def test_a_landmarks_descriptor_is_one_of_its_own_with_octave_and_distance(surve
         seen = np.column_stack([observations.pixels[rows], 10.0 * observations.octaves[rows]])
         _, near = places.query(seen, k=4)  # aligned by a pixel or so, a corner may have come closer to another one
         ids = observations.landmark_index[rows]
+        upward = upward_deg(content.camera, observations.pixels[rows], content.keyframes.rotations[k][2])
+        turned = features.angles_deg[near] - (upward + landmarks.angles_deg[ids])[:, None]
+        is_own = (features.descriptors[near] == landmarks.descriptors[ids][:, None]).all(axis=2)
         away = np.linalg.norm(landmarks.points_m[ids] - content.keyframes.positions_m[k], axis=1)
         found[ids] |= (
-            (features.descriptors[near] == landmarks.descriptors[ids][:, None]).all(axis=2).any(axis=1)
+            (is_own & (np.cos(np.radians(turned)) > np.cos(np.radians(0.5)))).any(axis=1)
             & (observations.octaves[rows] == landmarks.octaves[ids])
             & (np.abs(away - landmarks.distances_m[ids]) < 1e-2)
         )

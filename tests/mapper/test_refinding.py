@@ -48,7 +48,11 @@ def drive_past(growing: GrowingMap, seen: Place, rng: np.random.Generator, frame
         noise = rng.normal(0.0, noise_px, (len(shown), 2))
         flips = np.packbits(rng.random((len(shown), 256)) < 0.04, axis=1)
         features = Features(
-            pixels[shown] + noise, np.zeros(len(shown), np.uint8), seen.descriptors[shown] ^ flips, 1.2
+            pixels[shown] + noise,
+            np.zeros(len(shown), np.uint8),
+            seen.descriptors[shown] ^ flips,
+            np.zeros(len(shown), np.float32),
+            1.2,
         )
         index = len(growing.keyframes)
         keyframe = growing.add_keyframe(

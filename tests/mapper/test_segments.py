@@ -26,6 +26,7 @@ def segment(first_frame: int, points: int, seed: int) -> Segment:
             rng.uniform(0.0, 400.0, (points, 2)),
             np.zeros(points, np.uint8),
             rng.integers(0, 256, (points, 32), dtype=np.uint8),
+            np.zeros(points, np.float32),
             1.2,
         )
         pose = Pose(so3_exp(rng.normal(0.0, 0.1, 3)), rng.normal(0.0, 2.0, 3))

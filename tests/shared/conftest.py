@@ -105,6 +105,7 @@ def street_map(
             (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32),
             rng.integers(0, 8, landmarks, dtype=np.uint8),
             rng.uniform(2.0, 80.0, landmarks).astype(np.float32),
+            angles_deg=np.random.default_rng(seed + 1).uniform(0.0, 360.0, landmarks).astype(np.float32),
         ),
         Observations(
             pairs[:, 0].astype(np.int32),

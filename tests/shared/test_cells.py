@@ -68,6 +68,10 @@ def assert_localizes_like(merged: LocalizationMap, visual_map: VisualMap) -> Non
     np.testing.assert_allclose(np.linalg.norm(merged.landmarks.normals, axis=1), 1.0, rtol=1e-6)
     turned_rad = np.arccos(np.clip(np.sum(merged.landmarks.normals * landmarks.normals[observed], axis=1), -1, 1))
     assert np.degrees(turned_rad.max()) < 1.0
+    assert merged.landmarks.angles_deg is not None
+    assert landmarks.angles_deg is not None
+    turned_deg = (merged.landmarks.angles_deg - landmarks.angles_deg[observed] + 180.0) % 360.0 - 180.0
+    assert np.abs(turned_deg).max() < 2.82
     pairs = set(zip(merged.seen_by_keyframe.tolist(), observed[merged.seen_landmark].tolist(), strict=True))
     observations = visual_map.observations
     assert pairs == set(
@@ -203,6 +207,17 @@ def test_precision_comes_back_a_little_too_pessimistic_and_never_too_optimistic(
     covariances = merged.keyframes.covariances
     assert covariances is not None
     np.testing.assert_array_equal(np.isnan(covariances[:, 0, 0]), np.arange(len(covariances)) % 2 == 1)
+
+
+def test_a_map_that_does_not_tell_its_descriptors_orientations_comes_back_without_them(make_map: MakeMap) -> None:
+    told = make_map()
+    visual_map = replace(told, landmarks=replace(told.landmarks, angles_deg=None))
+    merged = merge_cells(visual_map.anchor, list(through_bytes(visual_map).values()))
+    assert merged.landmarks.angles_deg is None
+    np.testing.assert_array_equal(
+        merged.landmarks.descriptors,
+        visual_map.landmarks.descriptors[np.unique(visual_map.observations.landmark_index)],
+    )
 
 
 def test_landmarks_are_rounded_no_more_than_they_are_uncertain_and_alike_in_every_cell(make_map: MakeMap) -> None:

@@ -76,6 +76,15 @@ def assert_equal_maps(read: VisualMap, written: VisualMap) -> None:
             np.testing.assert_array_equal(ours, theirs)
 
 
+def test_a_map_that_does_not_tell_its_descriptors_orientations_comes_back_without_them(
+    write: Write, make_map: MakeMap, tmp_path: Path
+) -> None:
+    told = make_map()
+    written = replace(told, landmarks=replace(told.landmarks, angles_deg=None))
+    write(tmp_path / "street", written)
+    assert_equal_maps(open_package(tmp_path / "street").visual_map(), written)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_the_whole_map_comes_back_exactly(write: Write, make_map: MakeMap, tmp_path: Path, seed: int) -> None:
     written = make_map(seed)
@@ -383,6 +392,8 @@ def with_first(value: object) -> Callable[[Any], Any]:
         ("landmarks", "points_m", with_first(-1.1e6), "a landmark lies more than 1,000 km from"),
         ("landmarks", "distances_m", with_first(-1.0), "negative distance"),
         ("landmarks", "octaves", lambda column: column[1:], "'landmark_octaves' has shape"),
+        ("landmarks", "angles_deg", lambda column: column[1:], "'landmark_angles_deg' is not one finite number"),
+        ("landmarks", "angles_deg", with_first(np.nan), "'landmark_angles_deg' is not one finite number"),
         ("observations", "landmark_index", with_first(10_000), "observed landmarks lie outside the 900 there are"),
         ("observations", "landmark_index", with_first(-1), "observed landmarks lie outside"),
         ("observations", "keyframe_index", with_first(60), "observed keyframes lie outside the 60 there are"),
@@ -455,7 +466,7 @@ def test_a_map_of_one_keyframe_is_a_map(write: Write, make_map: MakeMap, tmp_pat
 
 
 def test_a_cell_takes_less_than_48_bytes_per_landmark(write: Write, make_map: MakeMap, tmp_path: Path) -> None:
-    """32 of them descriptor, which nothing packs; positions take about 6.5, normals 3, who sees what 1.5."""
+    """32 of them descriptor, which nothing packs; positions about 6.5, directions 4, who sees what 1.5."""
     manifest = write(tmp_path / "street", make_map(keyframes=100, landmarks=10_000, length_m=100.0))
     for record in manifest.parts:
         if record.kind == "cell" and record.landmarks > 1_000:

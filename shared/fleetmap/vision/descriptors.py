@@ -15,24 +15,29 @@ from numba import njit
 from numpy.typing import NDArray
 
 from fleetmap.vision.orb_pattern import pattern_offsets_px
-from fleetmap.vision.pyramid import GreyImage
+from fleetmap.vision.pyramid import GreyImage, blurred
 
 DESCRIPTOR_BYTES = 32
 BORDER_PX = 19  # what turning a descriptor's pattern may need on each side
 _PATCH_RADIUS_PX = 15  # of the circle that orientation is measured in
 _PATTERN = pattern_offsets_px()
-# Not cv2.GaussianBlur: for bytes it has an arithmetic of its own, which cv2.ORB does not meet.
-_BLUR = cv2.getGaussianKernel(7, 2.0, cv2.CV_32F)
 _DEG = np.float32(np.pi / 180.0)
 _ROUNDER = np.float32(1.5 * 2**23)  # added and taken away again it leaves a float32 whole, half to even
 
 
 def describe(image: GreyImage, pixels: NDArray[np.int32]) -> NDArray[np.uint8]:
     """Descriptors (N, 32) of whole pixels (N, 2) of one level of a pyramid, at least BORDER_PX from its border."""
+    if len(pixels) == 0:
+        return np.empty((0, DESCRIPTOR_BYTES), dtype=np.uint8)
+    return describe_along(blurred(image), pixels, orientations_deg(image, pixels))
+
+
+def describe_along(
+    blurred_image: GreyImage, pixels: NDArray[np.int32], angles_deg: NDArray[np.float32]
+) -> NDArray[np.uint8]:
+    """The same with given orientations (N,), from the blurred level."""
     descriptors = np.empty((len(pixels), DESCRIPTOR_BYTES), dtype=np.uint8)
-    if len(pixels) > 0:
-        blurred = cv2.sepFilter2D(image, -1, _BLUR, _BLUR, borderType=cv2.BORDER_REFLECT_101)
-        _describe(blurred.ravel(), image.shape[1], pixels, orientations_deg(image, pixels), _PATTERN, descriptors)
+    _describe(blurred_image.ravel(), blurred_image.shape[1], pixels, angles_deg, _PATTERN, descriptors)
     return descriptors
 
 

@@ -8,6 +8,7 @@ the next image of a drive; of peaks of the smaller eigenvalue (Shi & Tomasi), an
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -17,8 +18,8 @@ from numpy.typing import NDArray
 from fleetmap.camera import Camera
 from fleetmap.errors import CalibrationError
 from fleetmap.vision.corners import corner_scores, corners_of, spread_evenly
-from fleetmap.vision.descriptors import BORDER_PX, describe
-from fleetmap.vision.pyramid import GreyImage, image_from_level_px, image_pyramid
+from fleetmap.vision.descriptors import BORDER_PX, describe_along, orientations_deg
+from fleetmap.vision.pyramid import GreyImage, Pyramid, image_from_level_px, image_pyramid
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -43,6 +44,7 @@ class Features:
     pixels: Array  # (N, 2) float64 undistorted pixels (Camera.undistort); may lie outside the image
     octaves: NDArray[np.uint8]  # (N,) uint8 pyramid level
     descriptors: NDArray[np.uint8]  # (N, 32) uint8
+    angles_deg: NDArray[np.float32]  # (N,) float32 orientation in the image as recorded, from x towards y
     scale_factor: float  # between pyramid levels
     camera: Camera | None = None  # whose lens was undone; None = one without distortion
 
@@ -71,44 +73,46 @@ class FeatureExtractor:
         """
         return self.extract_from(self.pyramid(image))
 
-    def pyramid(self, image: NDArray[np.uint8]) -> list[GreyImage]:
-        """The levels that features of a grey image (H, W) uint8 are found on, the image itself first.
+    def pyramid(self, image: NDArray[np.uint8]) -> Pyramid:
+        """The levels that features of a grey image (H, W) uint8 are found on.
 
         Raises:
             CalibrationError: the image does not have the calibrated size.
         """
         self._check_size(image)
-        return image_pyramid(image, self.settings.levels, self.settings.scale_factor)
+        return Pyramid(tuple(image_pyramid(image, self.settings.levels, self.settings.scale_factor)))
 
-    def extract_from(self, pyramid: list[GreyImage]) -> Features:
+    def extract_from(self, pyramid: Pyramid) -> Features:
         """Features of the image that ``pyramid`` was made of."""
-        shape = pyramid[0].shape
-        chosen = self._chosen_corners(pyramid)
-        descriptors = np.concatenate([describe(*on_level) for on_level in zip(pyramid, chosen, strict=True)])
+        levels, shape = pyramid.levels, pyramid.levels[0].shape
+        chosen = self._chosen_corners(levels)
+        angles = [orientations_deg(*on_level) for on_level in zip(levels, chosen, strict=True)]
+        descriptors = [describe_along(*on_level) for on_level in zip(pyramid.blurred, chosen, angles, strict=True)]
         recorded = [
             image_from_level_px(pixels.astype(np.float64), shape, level.shape)
-            for pixels, level in zip(chosen, pyramid, strict=True)
+            for pixels, level in zip(chosen, levels, strict=True)
         ]
-        octaves = np.repeat(np.arange(len(pyramid), dtype=np.uint8), [len(pixels) for pixels in chosen])
+        octaves = np.repeat(np.arange(len(levels), dtype=np.uint8), [len(pixels) for pixels in chosen])
         pixels, valid = self._undistort(np.concatenate(recorded))
         return Features(
             pixels=pixels[valid],
             octaves=octaves[valid],
-            descriptors=np.ascontiguousarray(descriptors[valid]),
+            descriptors=np.concatenate(descriptors)[valid],
+            angles_deg=np.concatenate(angles)[valid],
             scale_factor=self.settings.scale_factor,
             camera=self.camera if self.camera.has_distortion else None,
         )
 
-    def _chosen_corners(self, pyramid: list[GreyImage]) -> list[NDArray[np.int32]]:
+    def _chosen_corners(self, levels: Sequence[GreyImage]) -> list[NDArray[np.int32]]:
         """Pixels (n, 2) of every level, together at most ``count``."""
-        scores = [corner_scores(level) for level in pyramid]
+        scores = [corner_scores(level) for level in levels]
         for threshold in (self.settings.fast_threshold, self.settings.faint_fast_threshold):
             corners = [corners_of(level_scores, threshold, BORDER_PX) for level_scores in scores]
             if 2 * sum(len(on_level) for on_level in corners) >= self.settings.count:
                 break
         quotas = _octave_quotas(self.settings, np.array([len(on_level) for on_level in corners]))
         chosen = []
-        for level, on_level, quota in zip(pyramid, corners, quotas, strict=True):
+        for level, on_level, quota in zip(levels, corners, quotas, strict=True):
             cell_px = float(np.sqrt(level.size * _FEATURES_PER_CELL / max(quota, 1)))
             chosen.append(on_level.pixels[spread_evenly(on_level, quota, cell_px)])
         return chosen

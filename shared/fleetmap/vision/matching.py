@@ -63,32 +63,61 @@ def match_by_projection(
 
     A feature goes to at most one landmark, the closest in Hamming distance.
     """
+    pairs = pairs_in_windows(predicted_px, radii_px, octave_min, octave_max, features)
+    distances = _hamming_of_pairs(as_words(descriptors), as_words(features.descriptors), pairs)
+    return closest_of_pairs(pairs, distances, len(predicted_px), features, max_distance, ratio)
+
+
+def pairs_in_windows(
+    predicted_px: Array,
+    radii_px: Array,
+    octave_min: NDArray[np.integer],
+    octave_max: NDArray[np.integer],
+    features: Features,
+) -> IntArray:
+    """Rows of landmark and feature (P, 2) that could belong together, sorted by landmark.
+
+    Arguments as in :func:`match_by_projection`, whose first half this is.
+    """
     if len(predicted_px) == 0 or len(features) == 0:
-        return np.full(len(predicted_px), -1, dtype=np.int32)
-    origin, cells_across, cells_down, starts, members = grid(features.pixels, _CELL_PX)
-    chosen: IntArray = _match_in_windows(
+        return np.zeros((0, 2), dtype=np.int32)
+    pairs: IntArray = _pairs_in_windows(
         np.ascontiguousarray(predicted_px, dtype=np.float64),
         np.ascontiguousarray(radii_px, dtype=np.float64),
         np.ascontiguousarray(octave_min, dtype=np.int32),
         np.ascontiguousarray(octave_max, dtype=np.int32),
-        as_words(descriptors),
         np.ascontiguousarray(features.pixels),
         features.octaves.astype(np.int32),
-        as_words(features.descriptors),
-        origin,
-        cells_across,
-        cells_down,
-        starts,
-        members,
-        max_distance,
-        ratio,
+        *grid(features.pixels, _CELL_PX),
     )
+    return pairs
+
+
+def closest_of_pairs(
+    pairs: IntArray,
+    distances: NDArray[np.int64],
+    landmark_count: int,
+    features: Features,
+    max_distance: int,
+    ratio: float,
+) -> IntArray:
+    """For each landmark one of its pairs (P, 2), by their distances (P,) in bits: the feature (L,) int32, or -1.
+
+    Arguments as in :func:`match_by_projection`, whose second half this is.
+    """
+    octaves = features.octaves.astype(np.int32)
+    chosen: IntArray = _closest_of_pairs(pairs, distances, landmark_count, octaves, max_distance, ratio)
     return chosen
 
 
 def medoid_descriptor(descriptors: Descriptors) -> int:
     """Index of the descriptor (K, 32) with the least median Hamming distance to the others."""
     return int(_medoid(as_words(descriptors)))
+
+
+def bits_apart(first: Descriptors, second: Descriptors) -> NDArray[np.int64]:
+    """Hamming distances (N,) of descriptors (N, 32) to those of the same rows of others."""
+    return np.asarray(np.bitwise_count(as_words(first) ^ as_words(second)).sum(axis=1, dtype=np.int64))
 
 
 def as_words(descriptors: Descriptors) -> NDArray[np.uint64]:
@@ -200,26 +229,20 @@ def grid(pixels, cell_px):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _match_in_windows(  # type: ignore[no-untyped-def]
+def _pairs_in_windows(  # type: ignore[no-untyped-def]
     predicted_px,
     radii_px,
     octave_min,
     octave_max,
-    words,
     feature_px,
     feature_octaves,
-    feature_words,
     origin,
     cells_across,
     cells_down,
     starts,
     members,
-    max_distance,
-    ratio,
 ):
-    chosen = np.full(len(predicted_px), -1, np.int32)
-    taken_at = np.full(len(feature_px), _NO_PAIR, np.int64)
-    taken_by = np.full(len(feature_px), -1, np.int64)
+    pairs, count = np.empty((4 * len(predicted_px), 2), np.int32), 0
     for landmark in range(len(predicted_px)):
         u, v, radius = predicted_px[landmark, 0], predicted_px[landmark, 1], radii_px[landmark]
         if not (np.isfinite(u) and np.isfinite(v) and radius > 0.0):
@@ -230,22 +253,49 @@ def _match_in_windows(  # type: ignore[no-untyped-def]
         bottom = min(cells_down - 1.0, np.floor((v + radius - origin[1]) / _CELL_PX))
         if right < left or bottom < top:
             continue
-        best, second, best_feature, best_octave, second_octave = _NO_PAIR, _NO_PAIR, -1, -1, -10
         for row in range(int(top), int(bottom) + 1):
-            for slot in range(starts[row * cells_across + int(left)], starts[row * cells_across + int(right) + 1]):
+            first, end = starts[row * cells_across + int(left)], starts[row * cells_across + int(right) + 1]
+            if count + end - first > len(pairs):
+                pairs = np.concatenate((pairs, np.empty((len(pairs) + end - first, 2), np.int32)))
+            for slot in range(first, end):
                 feature = members[slot]
                 octave = feature_octaves[feature]
                 if octave < octave_min[landmark] or octave > octave_max[landmark]:
                     continue
                 du, dv = feature_px[feature, 0] - u, feature_px[feature, 1] - v
-                if du * du + dv * dv > radius * radius:
-                    continue
-                distance = hamming(words, landmark, feature_words, feature)
-                if distance < best:
-                    second, second_octave = best, best_octave
-                    best, best_octave, best_feature = distance, octave, feature
-                elif distance < second:
-                    second, second_octave = distance, octave
+                if du * du + dv * dv <= radius * radius:
+                    pairs[count, 0], pairs[count, 1] = landmark, feature
+                    count += 1
+    return pairs[:count].copy()
+
+
+@njit(cache=True, nogil=True)
+def _hamming_of_pairs(landmark_words, feature_words, pairs):  # type: ignore[no-untyped-def]
+    distances = np.empty(len(pairs), np.int64)
+    for n in range(len(pairs)):
+        distances[n] = hamming(landmark_words, pairs[n, 0], feature_words, pairs[n, 1])
+    return distances
+
+
+@njit(cache=True, nogil=True)
+def _closest_of_pairs(  # type: ignore[no-untyped-def]
+    pairs, distances, landmark_count, feature_octaves, max_distance, ratio
+):
+    chosen = np.full(landmark_count, -1, np.int32)
+    taken_at = np.full(len(feature_octaves), _NO_PAIR, np.int64)
+    taken_by = np.full(len(feature_octaves), -1, np.int64)
+    n = 0
+    while n < len(pairs):
+        landmark = pairs[n, 0]
+        best, second, best_feature, best_octave, second_octave = _NO_PAIR, _NO_PAIR, -1, -1, -10
+        while n < len(pairs) and pairs[n, 0] == landmark:
+            feature, distance = pairs[n, 1], distances[n]
+            if distance < best:
+                second, second_octave = best, best_octave
+                best, best_octave, best_feature = distance, feature_octaves[feature], feature
+            elif distance < second:
+                second, second_octave = distance, feature_octaves[feature]
+            n += 1
         if best > max_distance or (abs(best_octave - second_octave) <= 1 and best > ratio * second):
             continue
         if best < taken_at[best_feature]:

@@ -10,12 +10,35 @@ with s from the whole sizes: at the far border of an image, the nominal factor w
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 GreyImage = NDArray[np.uint8]
+# Not cv2.GaussianBlur: for bytes it has an arithmetic of its own, which cv2.ORB does not meet.
+_BLUR = cv2.getGaussianKernel(7, 2.0, cv2.CV_32F)
+
+
+@dataclass(frozen=True)
+class Pyramid:
+    """The levels of an image, itself first; and the same as descriptors look at them."""
+
+    levels: tuple[GreyImage, ...]
+
+    @cached_property
+    def blurred(self) -> tuple[GreyImage, ...]:
+        """See fleetmap.vision.descriptors."""
+        return tuple(blurred(level) for level in self.levels)
+
+
+def blurred(image: GreyImage) -> GreyImage:
+    """A level as descriptors look at it."""
+    smooth = cv2.sepFilter2D(image, -1, _BLUR, _BLUR, borderType=cv2.BORDER_REFLECT_101)
+    return np.asarray(smooth, dtype=np.uint8)
 
 
 def image_pyramid(image: GreyImage, levels: int, scale_factor: float) -> list[GreyImage]:

@@ -8,7 +8,9 @@ import pytest
 
 from fleetmap.camera import Camera
 from fleetmap.errors import CalibrationError
+from fleetmap.vision.descriptors import describe_along
 from fleetmap.vision.features import FeatureExtractor, Features, FeatureSettings
+from fleetmap.vision.pyramid import level_from_image_px
 
 CAMERA = Camera(640, 400, 500.0, 500.0, 319.5, 199.5)
 
@@ -69,8 +71,19 @@ def test_an_image_without_texture_has_no_features(level: int) -> None:
 def test_the_same_image_gives_the_same_features_bit_by_bit() -> None:
     image = textured_image(seed=3)
     first, second = FeatureExtractor(CAMERA).extract(image), FeatureExtractor(CAMERA).extract(image.copy())
-    for name in ("pixels", "octaves", "descriptors"):
+    for name in ("pixels", "octaves", "descriptors", "angles_deg"):
         assert np.array_equal(getattr(first, name), getattr(second, name))
+
+
+def test_orientations_stand_with_their_descriptors() -> None:
+    image = textured_image(seed=5)
+    extractor = FeatureExtractor(CAMERA)
+    features, pyramid = extractor.extract(image), extractor.pyramid(image)
+    for octave, (level, blurred) in enumerate(zip(pyramid.levels, pyramid.blurred, strict=True)):
+        on_level = features.octaves == octave
+        pixels = np.rint(level_from_image_px(features.pixels[on_level], image.shape, level.shape)).astype(np.int32)
+        again = describe_along(blurred, pixels, features.angles_deg[on_level])
+        assert np.array_equal(again, features.descriptors[on_level])
 
 
 def test_pixels_are_undistorted() -> None:

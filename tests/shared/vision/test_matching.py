@@ -34,6 +34,7 @@ def features_at(pixels: np.ndarray, descriptors: np.ndarray, octaves: np.ndarray
         pixels=np.asarray(pixels, dtype=np.float64),
         octaves=np.zeros(len(pixels), np.uint8) if octaves is None else octaves.astype(np.uint8),
         descriptors=descriptors,
+        angles_deg=np.zeros(len(pixels), np.float32),
         scale_factor=1.2,
     )
 
