@@ -100,7 +100,7 @@ def find_candidates(
 def judged(view: MapView, camera: Camera, image: QueryImage, fit: Fit, settings: LocalizerSettings) -> Candidate:
     """A pose with all that speaks for it where nothing before vouches for it."""
     likeness = likeness_at(view, camera, image, fit.answer.map_from_cam)
-    score = place_score(likeness, fit.answer)
+    score = place_score(likeness)
     is_like = score >= settings.relocalization.min_place_score
     return Candidate(view, fit, likeness, score, is_like and is_trustworthy(fit, camera, settings.gate))
 
@@ -126,7 +126,7 @@ def _candidates_among(
     """
     options = settings.relocalization
     for initial, radii_px in _guesses(view, camera, image.features, keyframes, found, options):
-        fit = fit_around(view, camera, image.features, initial, radii_px, settings.fitting)
+        fit = fit_around(view, camera, image, initial, radii_px, settings.fitting)
         if fit is None or any(_is_found(each, view, fit.answer.map_from_cam) for each in found):
             continue
         candidate = judged(view, camera, image, fit, settings)

@@ -37,6 +37,9 @@ class FittingSettings:
 
     max_distance: int = 64  # Hamming bits
     ratio: float = 0.9
+    max_oriented_radius_px: float = (
+        15.0  # in windows up to here corners are described along the landmark's orientation
+    )
 
 
 @dataclass(frozen=True)
@@ -58,7 +61,7 @@ class RelocalizationSettings:
     wide_radii_px: tuple[float, ...] = (60.0, 30.0, 12.0, 5.0)  # from a keyframe's pose
     max_rival: float = 0.8  # another place with this share of the best's support makes the answer ambiguous
     min_lead_sigmas: float = 2.0  # of the best's inliers over those of a place that could be the answer as well
-    min_place_score: float = 0.5  # see place_score; of near-identical streets one in twenty is taken for the right
+    min_place_score: float = -0.25  # log-odds; of near-identical streets one in twenty is taken for the right
     clear_place_score: float = 3.5  # what has it ends the search, but for places that are as much alike
     min_score_lead: float = 3.0  # of the best over a rival, for the rival not to matter
 

@@ -25,7 +25,7 @@ def track(
         return None
     best = None
     for radii_px in settings.tracking.radii_px:
-        fit = fit_around(view, camera, image.features, predicted, radii_px, settings.fitting)
+        fit = fit_around(view, camera, image, predicted, radii_px, settings.fitting)
         if fit is not None and _continues(view, camera, image, motion, fit, settings):
             best = fit if best is None else max(best, fit, key=lambda each: each.answer.inlier_count)
         if best is not None and not has_lost_support(best, motion, settings):

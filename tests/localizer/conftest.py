@@ -24,6 +24,7 @@ from fleetmap.trajectory import Trajectory
 from fleetmap.transport import MapClient
 from fleetmap.vision.features import FeatureExtractor, Features
 from fleetmap.vision.matching import match_by_projection
+from fleetmap.vision.upward import upward_deg
 from fleetmap.visual_map import Keyframes, Landmarks, LocalizationMap, Observations, VisualMap
 from fleetmap_localizer import map_fetching
 from fleetmap_localizer.map_source import MapServer
@@ -107,7 +108,7 @@ def map_with_known_truth(street: Street, survey: Trajectory) -> VisualMap:
     extractor = FeatureExtractor(SURVEY_CAMERA)
     poses = [_in_map(street, survey.pose(i)) for i in range(len(survey))]
     features = [extractor.extract(render(street, SURVEY_CAMERA, pose, Look(seed=1))) for pose in poses]
-    points, descriptors, octaves, distances, normals = (np.zeros((0, n)) for n in (3, 32, 1, 1, 3))
+    points, descriptors, octaves, angles, distances, normals = (np.zeros((0, n)) for n in (3, 32, 1, 1, 1, 3))
     sightings: list[tuple[int, int, np.ndarray, int]] = []  # keyframe, landmark, pixel, octave
     for k, (pose, seen) in enumerate(zip(poses, features, strict=True)):
         found = _find(points, descriptors.astype(np.uint8), pose, seen)
@@ -122,6 +123,8 @@ def map_with_known_truth(street: Street, survey: Trajectory) -> VisualMap:
         points = np.vstack([points, new_points])
         descriptors = np.vstack([descriptors, seen.descriptors[new]])
         octaves = np.vstack([octaves, seen.octaves[new][:, None]])
+        upward = upward_deg(SURVEY_CAMERA, seen.pixels[new], pose.rotation[2])
+        angles = np.vstack([angles, (seen.angles_deg[new] - upward)[:, None]])
         distances = np.vstack([distances, np.linalg.norm(back, axis=1, keepdims=True)])
         normals = np.vstack([normals, back / np.linalg.norm(back, axis=1, keepdims=True)])
     counts = np.bincount([landmark for _, landmark, _, _ in sightings], minlength=len(points))
@@ -139,6 +142,7 @@ def map_with_known_truth(street: Street, survey: Trajectory) -> VisualMap:
             normals[kept].astype(np.float32),
             octaves[kept, 0].astype(np.uint8),
             distances[kept, 0].astype(np.float32),
+            angles_deg=angles[kept, 0].astype(np.float32) % 360.0,
         ),
         observations=Observations(
             np.array([s[0] for s in sightings], dtype=np.int32),

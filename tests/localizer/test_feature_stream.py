@@ -33,7 +33,7 @@ def test_every_frame_comes_with_its_own_features() -> None:
         assert np.array_equal(image.features.pixels, expected.pixels)
         assert np.array_equal(image.features.descriptors, expected.descriptors)
         assert len(image.features) > 50
-        assert np.array_equal(image.pyramid[0], frame.image)
+        assert np.array_equal(image.pyramid.levels[0], frame.image)
 
 
 def test_reading_and_finding_happen_elsewhere_and_not_far_ahead() -> None:

@@ -29,6 +29,15 @@ def test_at_its_features_an_image_is_described_as_they_are(image) -> None:
     assert np.array_equal(descriptors, image.features.descriptors)
 
 
+def test_along_another_orientation_they_are_others(image) -> None:
+    recorded_px, octaves = CAMERA.distort(image.features.pixels), image.features.octaves.astype(np.int64)
+    _, same = image.describe_at(recorded_px, octaves, image.features.angles_deg - 360.0)
+    _, turned = image.describe_at(recorded_px, octaves, image.features.angles_deg + 90.0)
+    assert np.mean(np.all(same == image.features.descriptors, axis=1)) > 0.99
+    bits = np.bitwise_count(turned ^ image.features.descriptors).sum(axis=1)
+    assert 90.0 < bits.mean() < 160.0
+
+
 def test_a_place_that_is_less_than_half_a_pixel_of_its_level_away_is_the_same(image) -> None:
     aside_px = 0.4 * 1.2 ** image.features.octaves.astype(np.float64)
     recorded_px = CAMERA.distort(image.features.pixels) + aside_px[:, None] * [[1.0, -1.0]]

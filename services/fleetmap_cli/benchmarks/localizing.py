@@ -39,6 +39,7 @@ _STAGES: tuple[tuple[str, Any, str], ...] = (
     ("places", relocalization, "PlaceSearch"),
     ("matching", relocalization, "match_descriptors"),
     ("matching", fitting, "match_by_projection"),
+    ("matching", fitting, "match_along"),
     ("matching", LocalMap, "landmarks_around"),
     ("matching", LocalMap, "predict"),
     ("likeness", relocalization, "likeness_at"),

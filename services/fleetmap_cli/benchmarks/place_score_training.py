@@ -1,9 +1,10 @@
-"""Learns how the evidence for a place is to be weighed: fleetmap_localizer.likeness.PLACE_WEIGHTS.
+"""Learns how the evidence for a place is to be weighed: PLACE_WEIGHTS of fleetmap_localizer.likeness.
 
-Use it as ``python -m fleetmap_cli.benchmarks.place_score_training``; it takes a quarter of an hour on two cores.
+Use it as ``python -m fleetmap_cli.benchmarks.place_score_training``; it takes half an hour on two cores.
 Second vehicles are asked for their pose in the map of their own street, and in that of a street of the same shape,
 a quarter of whose surfaces is the same. None of these streets is in a benchmark. Printed are the weights, and how
-many poses would be believed at which score, of streets that the weights were not learned from.
+many poses would be believed at which score, of streets that the weights were not learned from; then the same for
+maps that do not tell their descriptors' orientations, as those before format 2.1.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ Array = NDArray[np.float64]
 _FIRST_DRAW = 2000
 _KINDS = (*STREETS, "open")
 _QUERY_RATE_HZ = 4.0
-_RIGHT_M, _WRONG_M = 1.0, 2.0
+_RIGHT_M, _WRONG_M = 1.0, 5.0  # between them it may be the map that is wrong
 _RIDGE = 1.0  # on weights of standardised evidence
 
 
@@ -43,15 +44,19 @@ class Example:
     """The likeliest pose of one image."""
 
     draw: int
-    evidence: Array  # (6,) see fleetmap_localizer.likeness.place_evidence
+    evidence: Array  # (3,) see fleetmap_localizer.likeness.place_evidence
     is_right: bool
+    is_oriented: bool = True  # see fleetmap_localizer.likeness.Likeness
 
 
 def examples_of(draw: Draw) -> list[Example]:
     """Of the images of one street, and of its twin's where there is one, in its map."""
     source = draw.mapped()
+    landmarks = replace(source.content.landmarks, angles_deg=None)
+    sources = (source, replace(source, content=replace(source.content, landmarks=landmarks)))
     variants = (draw, replace(draw, variant=1)) if draw.has_twin else (draw,)
-    return [example for each in variants for example in _examples(each, source, each.images(_QUERY_RATE_HZ))]
+    images = [(each, list(each.images(_QUERY_RATE_HZ))) for each in variants]
+    return [example for each, seen in images for source in sources for example in _examples(each, source, seen)]
 
 
 def _examples(
@@ -67,12 +72,12 @@ def _examples(
         best = max(found, key=lambda each: each.support)  # not by score: weights are what is to be learned
         away_m = float(np.linalg.norm(best.utm_from_cam().translation_m - utm_from_cam.translation_m))
         if draw.variant or not _RIGHT_M < away_m < _WRONG_M:
-            evidence = place_evidence(best.likeness, best.fit.answer)
-            yield Example(draw.number, evidence, draw.variant == 0 and away_m <= _RIGHT_M)
+            evidence, is_right = place_evidence(best.likeness), draw.variant == 0 and away_m <= _RIGHT_M
+            yield Example(draw.number, evidence, is_right, best.likeness.is_oriented)
 
 
 def learn(evidence: Array, is_right: NDArray[np.bool_]) -> Array:
-    """Weights (6,) of a logistic regression; right and wrong examples count as much, however many there are.
+    """Weights (3,) of a logistic regression; right and wrong examples count as much, however many there are.
 
     Source: Newton's method, as in C. Bishop, "Pattern recognition and machine learning", 2006, section 4.3.3.
     """
@@ -112,7 +117,7 @@ def report(examples: list[Example]) -> str:
     """Weights, and what the scores of other streets tell apart."""
     evidence, is_right, _ = _columns(examples)
     scores = scores_of_others(examples)
-    lines = [f"PLACE_WEIGHTS = np.array({learn(evidence, is_right).round(2).tolist()})"]
+    lines = [f"{learn(evidence, is_right).round(2).tolist()}"]
     lines.append(f"{np.count_nonzero(is_right)} right, {np.count_nonzero(~is_right)} wrong")
     for least in np.arange(-2.0, 6.1, 0.5):
         right, wrong = (100.0 * np.mean(scores[which] >= least) for which in (is_right, ~is_right))
@@ -128,7 +133,9 @@ def _main() -> None:
     count = parser.parse_args().streets
     draws = [Draw(_FIRST_DRAW + number, _KINDS[number % len(_KINDS)]) for number in range(count)]
     with ProcessPoolExecutor(usable_cores(), mp_context=multiprocessing.get_context("spawn")) as executor:
-        print(report([example for examples in executor.map(examples_of, draws) for example in examples]))
+        drawn = [example for examples in executor.map(examples_of, draws) for example in examples]
+    for title, is_oriented in (("PLACE_WEIGHTS", True), ("PLACE_WEIGHTS_UNORIENTED", False)):
+        print(f"{title}: {report([each for each in drawn if each.is_oriented == is_oriented])}")
 
 
 if __name__ == "__main__":
