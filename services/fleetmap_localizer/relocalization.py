@@ -100,9 +100,10 @@ def find_candidates(
 def judged(view: MapView, camera: Camera, image: QueryImage, fit: Fit, settings: LocalizerSettings) -> Candidate:
     """A pose with all that speaks for it where nothing before vouches for it."""
     likeness = likeness_at(view, camera, image, fit.answer.map_from_cam)
-    score = place_score(likeness)
-    is_like = score >= settings.relocalization.min_place_score
-    return Candidate(view, fit, likeness, score, is_like and is_trustworthy(fit, camera, settings.gate))
+    score, options = place_score(likeness), settings.relocalization
+    least = options.min_place_score if likeness.is_oriented else options.min_place_score_unoriented
+    is_trusted = score >= least and is_trustworthy(fit, camera, settings.gate)
+    return Candidate(view, fit, likeness, score, is_trusted)
 
 
 def is_same(first: Located, second: Located) -> bool:

@@ -62,6 +62,7 @@ class RelocalizationSettings:
     max_rival: float = 0.8  # another place with this share of the best's support makes the answer ambiguous
     min_lead_sigmas: float = 2.0  # of the best's inliers over those of a place that could be the answer as well
     min_place_score: float = -0.25  # log-odds; of near-identical streets one in twenty is taken for the right
+    min_place_score_unoriented: float = 0.5  # the same for maps that do not tell descriptors' orientations
     clear_place_score: float = 3.5  # what has it ends the search, but for places that are as much alike
     min_score_lead: float = 3.0  # of the best over a rival, for the rival not to matter
 

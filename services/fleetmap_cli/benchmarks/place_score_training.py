@@ -1,6 +1,6 @@
 """Learns how the evidence for a place is to be weighed: PLACE_WEIGHTS of fleetmap_localizer.likeness.
 
-Use it as ``python -m fleetmap_cli.benchmarks.place_score_training``; it takes half an hour on two cores.
+Use it as ``python -m fleetmap_cli.benchmarks.place_score_training``; it takes a quarter of an hour on two cores.
 Second vehicles are asked for their pose in the map of their own street, and in that of a street of the same shape,
 a quarter of whose surfaces is the same. None of these streets is in a benchmark. Printed are the weights, and how
 many poses would be believed at which score, of streets that the weights were not learned from; then the same for
