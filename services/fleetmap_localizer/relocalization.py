@@ -71,6 +71,9 @@ def relocalize(
     if not found:
         return "the image shows no place that the map knows"
     best = max(found, key=lambda each: each.score)
+    if best.is_trusted and best.score < options.clear_place_score:
+        found += candidates_beside(best, camera, image, found, settings)
+        best = max(found, key=lambda each: each.score)
     if any(_is_rival(each, best, options) for each in found):
         return "the image could be of two places, which look too much alike"
     if not best.is_trusted:
@@ -134,6 +137,25 @@ def _candidates_among(
         yield candidate
         if candidate.score >= options.clear_place_score:
             return
+
+
+def candidates_beside(
+    one: Candidate, camera: Camera, image: QueryImage, found: Sequence[Candidate], settings: LocalizerSettings
+) -> list[Candidate]:
+    """What is new of the poses that steps to the side lead to.
+
+    Windows repeat: seen from another lane, those of a house may be taken for their neighbours, while all that is
+    far away agrees.
+    """
+    options, pose = settings.relocalization, one.fit.answer.map_from_cam
+    beside: list[Candidate] = []
+    for step_m in options.side_steps_m:
+        guess = Pose(pose.rotation, pose.translation_m + step_m * pose.rotation[:, 0])
+        fit = fit_around(one.view, camera, image, guess, options.side_radii_px, settings.fitting)
+        known = (*found, *beside)
+        if fit is not None and not any(_is_found(each, one.view, fit.answer.map_from_cam) for each in known):
+            beside.append(judged(one.view, camera, image, fit, settings))
+    return beside
 
 
 def _guesses(

@@ -59,6 +59,8 @@ class RelocalizationSettings:
     ransac_error_px: float = 6.0
     radii_px: tuple[float, ...] = (12.0, 5.0)  # windows around the projections, round after round
     wide_radii_px: tuple[float, ...] = (60.0, 30.0, 12.0, 5.0)  # from a keyframe's pose
+    side_steps_m: tuple[float, ...] = (-3.0, -1.5, 1.5, 3.0)  # looked at beside a pose that is not clear
+    side_radii_px: tuple[float, ...] = (30.0, 12.0, 5.0)
     max_rival: float = 0.8  # another place with this share of the best's support makes the answer ambiguous
     min_lead_sigmas: float = 2.0  # of the best's inliers over those of a place that could be the answer as well
     min_place_score: float = -0.25  # log-odds; of near-identical streets one in twenty is taken for the right

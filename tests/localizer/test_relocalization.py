@@ -12,7 +12,7 @@ from fleetmap.vision.features import FeatureExtractor
 from fleetmap.visual_map import LocalizationMap
 from fleetmap_localizer.map_view import LocalizableMap, MapView
 from fleetmap_localizer.query_image import QueryImage
-from fleetmap_localizer.relocalization import Located, relocalize
+from fleetmap_localizer.relocalization import Located, candidates_beside, find_candidates, relocalize
 from fleetmap_localizer.settings import LocalizerSettings
 
 SETTINGS = LocalizerSettings()
@@ -50,7 +50,7 @@ def thinned(content: LocalizationMap, kept: float) -> LocalizationMap:
     """The same map with a share of its landmarks."""
     stays = np.random.default_rng(6).random(len(content.landmarks)) < kept
     group, seen = content.landmarks, stays[content.seen_landmark]
-    arrays = ("points_m", "descriptors", "normals", "octaves", "distances_m", "sigmas_m")
+    arrays = ("points_m", "descriptors", "normals", "octaves", "distances_m", "sigmas_m", "angles_deg")
     held = {name: getattr(group, name) for name in arrays}
     return replace(
         content,
@@ -58,6 +58,21 @@ def thinned(content: LocalizationMap, kept: float) -> LocalizationMap:
         seen_by_keyframe=content.seen_by_keyframe[seen],
         seen_landmark=(np.cumsum(stays) - 1)[content.seen_landmark[seen]].astype(np.int32),
     )
+
+
+@pytest.mark.parametrize("aside_m", [-1.5, 1.5, 3.0])
+def test_beside_a_pose_in_the_wrong_lane_the_true_one_is_found(
+    look_into, mapped_street, second_drive, queries, aside_m: float
+) -> None:
+    view, camera = look_into(mapped_street.content, "street"), second_drive.camera
+    right = max(find_candidates([view], camera, queries[2], SETTINGS), key=lambda each: each.score)
+    pose = right.fit.answer.map_from_cam
+    shifted = replace(pose, translation_m=pose.translation_m + aside_m * pose.rotation[:, 0])
+    wrong = replace(right, fit=replace(right.fit, answer=replace(right.fit.answer, map_from_cam=shifted)))
+    beside = candidates_beside(wrong, camera, queries[2], [wrong], SETTINGS)
+    away_m = [np.linalg.norm(each.fit.answer.map_from_cam.translation_m - pose.translation_m) for each in beside]
+    assert min(away_m) < 0.05
+    assert candidates_beside(right, camera, queries[2], [right], SETTINGS) == []
 
 
 def answers(views: list[MapView], second_drive, queries: list[QueryImage]) -> list[Located | str]:
