@@ -37,9 +37,7 @@ class FittingSettings:
 
     max_distance: int = 64  # Hamming bits
     ratio: float = 0.9
-    max_oriented_radius_px: float = (
-        15.0  # in windows up to here corners are described along the landmark's orientation
-    )
+    max_oriented_radius_px: float = 15.0  # in windows up to here corners are described as the landmarks were
 
 
 @dataclass(frozen=True)
