@@ -15,7 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from fleetmap.vision.orb_pattern import pattern_offsets_px
-from fleetmap.vision.pyramid import GreyImage, blurred
+from fleetmap.vision.pyramid import GreyImage
 
 DESCRIPTOR_BYTES = 32
 BORDER_PX = 19  # what turning a descriptor's pattern may need on each side
@@ -25,17 +25,13 @@ _DEG = np.float32(np.pi / 180.0)
 _ROUNDER = np.float32(1.5 * 2**23)  # added and taken away again it leaves a float32 whole, half to even
 
 
-def describe(image: GreyImage, pixels: NDArray[np.int32]) -> NDArray[np.uint8]:
-    """Descriptors (N, 32) of whole pixels (N, 2) of one level of a pyramid, at least BORDER_PX from its border."""
-    if len(pixels) == 0:
-        return np.empty((0, DESCRIPTOR_BYTES), dtype=np.uint8)
-    return describe_along(blurred(image), pixels, orientations_deg(image, pixels))
-
-
 def describe_along(
     blurred_image: GreyImage, pixels: NDArray[np.int32], angles_deg: NDArray[np.float32]
 ) -> NDArray[np.uint8]:
-    """The same with given orientations (N,), from the blurred level."""
+    """Descriptors (N, 32) of whole pixels (N, 2) of one level, at least BORDER_PX from its border.
+
+    They are taken from the blurred level, along orientations (N,).
+    """
     descriptors = np.empty((len(pixels), DESCRIPTOR_BYTES), dtype=np.uint8)
     _describe(blurred_image.ravel(), blurred_image.shape[1], pixels, angles_deg, _PATTERN, descriptors)
     return descriptors

@@ -5,8 +5,13 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from fleetmap.vision.descriptors import BORDER_PX, DESCRIPTOR_BYTES, describe, orientations_deg
-from fleetmap.vision.pyramid import image_pyramid
+from fleetmap.vision.descriptors import BORDER_PX, DESCRIPTOR_BYTES, describe_along, orientations_deg
+from fleetmap.vision.pyramid import blurred, image_pyramid
+
+
+def describe(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Along what each corner shows, as features are."""
+    return describe_along(blurred(image), pixels, orientations_deg(image, pixels))
 
 
 def textured_image() -> np.ndarray:
