@@ -1,13 +1,18 @@
 """The order in which landmarks help most: a lazy greedy choice, compiled.
 
-Every keyframe that saw a landmark gains twice by it: its pose would be known better, by the determinant of the
-information to expect (D-optimality), and a part of its image that has few landmarks gets one more. Both returns
-diminish, so gains that were computed once are upper bounds ever after, and a heap of them finds the next landmark
-without looking at all of them again.
+Every keyframe that saw a landmark gains twice by it: its position would be known better, by the determinant of its
+covariance to expect (D_s-optimality), and a part of its image that has few landmarks gets one more. Not the whole
+pose's determinant: there what is far away counts as much for its orientation as what is near does for its
+position, but orientation a view has plenty of, and it is the metres that a map is asked for.
 
-Sources: L. Carlone, S. Karaman, "Attention and anticipation in fast visual-inertial navigation", T-RO 2019,
-section IV (greedy choice of features by log det of the information); M. Minoux, "Accelerated greedy algorithms for
-maximizing submodular set functions", 1978.
+Returns diminish, so gains that were computed once serve as upper bounds, and a heap of them finds the next
+landmark without looking at all of them again. Of a position alone that is not true to the letter: a landmark may
+become worth more by another that holds the orientation. So now and then all gains are looked at again.
+
+Sources: A. Atkinson, A. Donev, R. Tobias, "Optimum experimental designs, with SAS", 2007, section 10.3 (a part of
+the parameters); L. Carlone, S. Karaman, "Attention and anticipation in fast visual-inertial navigation", T-RO
+2019, section IV (greedy choice of features by log det of the information); M. Minoux, "Accelerated greedy
+algorithms for maximizing submodular set functions", 1978.
 """
 
 from __future__ import annotations
@@ -21,7 +26,8 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Ids = NDArray[np.int64]
 
-_WEIGHT_OF_POSE = 2.0  # against that of a well-filled image
+_WEIGHT_OF_POSITION = 10.0  # against that of a well-filled image
+_LOOK_AGAIN = 1.25  # all gains are looked at again whenever so many times as many are chosen
 _PRIOR_RAD, _PRIOR_M = 0.1, 1.0  # what a keyframe's pose is known to before any landmark is chosen
 
 
@@ -62,7 +68,7 @@ def _choose(landmarks, views, state):  # type: ignore[no-untyped-def]
     heap = np.argsort(-gains, kind="mergesort")
     gains = gains[heap]
     order = np.empty(total, np.int64)
-    chosen, size = 0, total
+    chosen, size, next_look = 0, total, 1
     while size > 0:
         top = heap[0]
         gain = _gain(top, landmarks, views, state)
@@ -74,30 +80,40 @@ def _choose(landmarks, views, state):  # type: ignore[no-untyped-def]
             _take(top, landmarks, views, state)
             size -= 1
             heap[0], gains[0] = heap[size], gains[size]
+            if chosen == next_look:
+                next_look = int(np.ceil(_LOOK_AGAIN * chosen))
+                _look_again(heap[:size], gains[:size], landmarks, views, state)
         _sink(heap, gains, size)
     return order
 
 
 @njit(cache=True, nogil=True)
+def _look_again(heap, gains, landmarks, views, state):  # type: ignore[no-untyped-def]
+    for slot in range(len(heap)):
+        gains[slot] = _gain(heap[slot], landmarks, views, state)
+    by_gain = np.argsort(-gains, kind="mergesort")
+    heap[:], gains[:] = heap[by_gain], gains[by_gain]
+
+
+@njit(cache=True, nogil=True)
 def _gain(i, landmarks, views, state):  # type: ignore[no-untyped-def]
-    """What landmark i would add: twice log det(I + p J P J^T), and p / (1 + n) of a part of the image."""
+    """What landmark i would add: how much log det of the position's part of P falls, and p / (1 + n)."""
     chances, costs = landmarks
     p = chances[i]
+    if p <= 0.0:
+        return 0.0
     starts, keyframes, parts, jacobians = views
     covariances, counts = state
+    JP, after = np.empty((2, 6)), np.empty((3, 3))
     total = 0.0
     for m in range(starts[i], starts[i + 1]):
-        a, b, c = 1.0, 0.0, 1.0
         P = covariances[keyframes[m]]
-        for row in range(6):
-            u, v = 0.0, 0.0
-            for column in range(6):
-                u += P[row, column] * jacobians[m, 0, column]
-                v += P[row, column] * jacobians[m, 1, column]
-            a += p * jacobians[m, 0, row] * u
-            b += p * jacobians[m, 0, row] * v
-            c += p * jacobians[m, 1, row] * v
-        total += _WEIGHT_OF_POSE * np.log(a * c - b * b) + p / (1.0 + counts[parts[m]])
+        a, b, c = _inverse_innovation(P, jacobians[m], p, JP)
+        for row in range(3):
+            u, v = a * JP[0, 3 + row] + b * JP[1, 3 + row], b * JP[0, 3 + row] + c * JP[1, 3 + row]
+            for column in range(3):
+                after[row, column] = P[3 + row, 3 + column] - u * JP[0, 3 + column] - v * JP[1, 3 + column]
+        total += _WEIGHT_OF_POSITION * np.log(_det(P[3:, 3:]) / _det(after)) + p / (1.0 + counts[parts[m]])
     return total / costs[i]
 
 
@@ -109,26 +125,42 @@ def _take(i, landmarks, views, state):  # type: ignore[no-untyped-def]
         return
     starts, keyframes, parts, jacobians = views
     covariances, counts = state
-    K = np.empty((2, 6))
+    JP = np.empty((2, 6))
     for m in range(starts[i], starts[i + 1]):
         counts[parts[m]] += p
         P = covariances[keyframes[m]]
-        for n in range(2):
-            for row in range(6):
-                K[n, row] = 0.0
-                for column in range(6):
-                    K[n, row] += P[row, column] * jacobians[m, n, column]
-        a, b, c = 1.0 / p, 0.0, 1.0 / p
+        a, b, c = _inverse_innovation(P, jacobians[m], p, JP)
         for row in range(6):
-            a += jacobians[m, 0, row] * K[0, row]
-            b += jacobians[m, 0, row] * K[1, row]
-            c += jacobians[m, 1, row] * K[1, row]
-        scale = 1.0 / (a * c - b * b)
-        for row in range(6):
-            u = (c * K[0, row] - b * K[1, row]) * scale
-            v = (a * K[1, row] - b * K[0, row]) * scale
+            u, v = a * JP[0, row] + b * JP[1, row], b * JP[0, row] + c * JP[1, row]
             for column in range(6):
-                P[row, column] -= u * K[0, column] + v * K[1, column]
+                P[row, column] -= u * JP[0, column] + v * JP[1, column]
+
+
+@njit(cache=True, nogil=True)
+def _inverse_innovation(P, J, p, JP):  # type: ignore[no-untyped-def]
+    """The entries (a, b; b, c) of (I / p + J P J^T)^-1; fills J P (2, 6)."""
+    a, b, c = 1.0 / p, 0.0, 1.0 / p
+    for column in range(6):
+        u, v = 0.0, 0.0
+        for row in range(6):
+            u += J[0, row] * P[row, column]
+            v += J[1, row] * P[row, column]
+        JP[0, column], JP[1, column] = u, v
+        a += u * J[0, column]
+        b += u * J[1, column]
+        c += v * J[1, column]
+    scale = 1.0 / (a * c - b * b)
+    return c * scale, -b * scale, a * scale
+
+
+@njit(cache=True, nogil=True)
+def _det(M):  # type: ignore[no-untyped-def]
+    """Of a matrix (3, 3)."""
+    return (
+        M[0, 0] * (M[1, 1] * M[2, 2] - M[1, 2] * M[2, 1])
+        - M[0, 1] * (M[1, 0] * M[2, 2] - M[1, 2] * M[2, 0])
+        + M[0, 2] * (M[1, 0] * M[2, 1] - M[1, 1] * M[2, 0])
+    )
 
 
 @njit(cache=True, nogil=True)

@@ -1,10 +1,10 @@
 """What of a map goes into its cells, so that other vehicles localise well in few bytes.
 
-Landmarks are chosen one by one, always the one that helps most for its bytes. A landmark helps every keyframe that
-saw it, the more the fewer are chosen already in that part of the keyframe's image and on that octave: a view full
-of landmarks needs no more of them, a bare one takes what there is. It helps less where it is inexact, or easily
-taken for another. The sum of such returns, diminishing as 1/n, is submodular; so the greedy choice is within
-1 - 1/e of the best one, and a heap of outdated gains finds it (lazy evaluation).
+Landmarks are chosen one by one, always the one that helps most for its bytes. A landmark helps every keyframe
+that saw it, the more the less is known of its position from those chosen already, and the fewer of them lie in
+that part of its image: a view full of landmarks needs no more of them, a bare one takes what there is. It helps
+less where it is inexact, or easily taken for another. Were all returns diminishing (submodular), the greedy choice
+would be within 1 - 1/e of the best one; see fleetmap.greedy_choice.
 
 Sources: M. Dymczyk et al., "The gist of maps - summarizing experience for lifelong localization", ICRA 2015, and
 S. Lynen et al., "Get out of my lab", RSS 2015, section IV (landmarks that many keyframes saw, every keyframe with
