@@ -21,7 +21,7 @@ class LocalMapSettings:
 class GateSettings:
     """What a pose must show before anything else is asked: no pose is better than a wrong one."""
 
-    chance_ratio: float = 0.0075  # of the landmarks that should be in view: how many may agree with a wrong pose
+    chance_ratio: float = 0.01  # of the landmarks that should be in view: how many may agree with a wrong pose
     max_chance: float = 1e-3  # that so many agree with a wrong pose, see fleetmap_localizer.gate.chance_of
     min_coverage: float = 0.3  # share of the view's cells, where landmarks are expected, in which some agree
     max_position_sigma_m: float = 0.3
@@ -85,7 +85,7 @@ class TrackingSettings:
 class LocalizerSettings:
     """All groups together."""
 
-    features: FeatureSettings = field(default_factory=FeatureSettings)
+    features: FeatureSettings = field(default_factory=lambda: FeatureSettings(count=4000))
     place_index: PlaceIndexSettings = field(default_factory=PlaceIndexSettings)
     local_map: LocalMapSettings = field(default_factory=LocalMapSettings)
     gate: GateSettings = field(default_factory=GateSettings)

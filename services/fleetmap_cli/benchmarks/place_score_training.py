@@ -64,7 +64,7 @@ def _examples(
 ) -> Iterator[Example]:
     settings = LocalizerSettings()
     camera = draw.query().camera
-    views, extractor = [MapView(source, camera, settings)], FeatureExtractor(camera)
+    views, extractor = [MapView(source, camera, settings)], FeatureExtractor(camera, settings.features)
     for _, frame, utm_from_cam in images:
         found = find_candidates(views, camera, QueryImage.of(frame, extractor), settings)
         if not found:
