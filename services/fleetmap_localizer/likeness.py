@@ -102,8 +102,8 @@ def place_evidence(likeness: Likeness) -> Array:
     return np.array([likeness.alike, likeness.landmarks_alike, 1.0])
 
 
-PLACE_WEIGHTS = np.array([22.08, 18.46, -29.54])
-PLACE_WEIGHTS_UNORIENTED = np.array([16.25, 8.96, -8.77])
+PLACE_WEIGHTS = np.array([23.49, 17.43, -30.13])
+PLACE_WEIGHTS_UNORIENTED = np.array([16.42, 8.37, -8.57])
 
 
 @njit(cache=True, nogil=True)
