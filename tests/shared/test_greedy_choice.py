@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -90,3 +92,14 @@ def test_everything_is_ordered_and_what_has_no_chance_comes_last(views: Views) -
     order = order_of_use(chances, np.ones(_LANDMARKS), views)
     assert sorted(order) == list(range(_LANDMARKS))
     assert set(order[-_LANDMARKS // 4 :]) == set(range(0, _LANDMARKS, 4))
+
+
+def test_what_almost_touches_the_lens_does_not_upset_the_order(views: Views) -> None:
+    """Two landmarks, centimetres before it."""
+    jacobians = views.jacobians.copy()
+    jacobians[: 2 * _KEYFRAMES, :, 3:] *= 100.0  # derivatives by the position grow as the distance falls
+    ones = np.ones(_LANDMARKS)
+    order = order_of_use(ones, ones, replace(views, jacobians=jacobians))
+    assert sorted(order) == list(range(_LANDMARKS))
+    others, at_random = order[order >= 2][:_CHOSEN], np.random.default_rng(1).permutation(_LANDMARKS)[:_CHOSEN]
+    assert log_det_of_positions(views, others) < log_det_of_positions(views, at_random) - 1.0
