@@ -62,14 +62,12 @@ def order_of_use(chances: Array, costs: Array, views: Views) -> Ids:
 @njit(cache=True, nogil=True)
 def _choose(landmarks, views, state):  # type: ignore[no-untyped-def]
     total = len(landmarks[0])
-    gains = np.empty(total)
-    for i in range(total):
-        gains[i] = _gain(i, landmarks, views, state)
-    heap = np.argsort(-gains, kind="mergesort")
-    gains = gains[heap]
-    order = np.empty(total, np.int64)
-    chosen, size, next_look = 0, total, 1
+    heap, gains, order = np.arange(total), np.empty(total), np.empty(total, np.int64)
+    chosen, size, next_look = 0, total, 0
     while size > 0:
+        if chosen == next_look:
+            _look_at_all(heap[:size], gains[:size], landmarks, views, state)
+            next_look = max(chosen + 1, int(np.ceil(_LOOK_AGAIN * chosen)))
         top = heap[0]
         gain = _gain(top, landmarks, views, state)
         if gain < gains[0] * (1.0 - 1e-9):
@@ -80,15 +78,13 @@ def _choose(landmarks, views, state):  # type: ignore[no-untyped-def]
             _take(top, landmarks, views, state)
             size -= 1
             heap[0], gains[0] = heap[size], gains[size]
-            if chosen == next_look:
-                next_look = int(np.ceil(_LOOK_AGAIN * chosen))
-                _look_again(heap[:size], gains[:size], landmarks, views, state)
         _sink(heap, gains, size)
     return order
 
 
 @njit(cache=True, nogil=True)
-def _look_again(heap, gains, landmarks, views, state):  # type: ignore[no-untyped-def]
+def _look_at_all(heap, gains, landmarks, views, state):  # type: ignore[no-untyped-def]
+    """The gains of all that is left; sorted, they are a heap."""
     for slot in range(len(heap)):
         gains[slot] = _gain(heap[slot], landmarks, views, state)
     by_gain = np.argsort(-gains, kind="mergesort")
