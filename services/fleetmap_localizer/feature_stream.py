@@ -14,7 +14,7 @@ _IMAGES_AHEAD = 2
 
 
 def with_features(
-    frames: Iterable[Frame], camera: Camera, settings: FeatureSettings | None = None
+    frames: Iterable[Frame], camera: Camera, settings: FeatureSettings
 ) -> Generator[QueryImage, None, None]:
     """Each frame with its features, in order; frames are read by one other thread, features found by a second.
 

